@@ -102,8 +102,8 @@ def _fields() -> list[Claim]:
             f"({a.spread():.1g} with the mean frame) and by {mirrored_eight.spread():.3f} for "
             f"eight neighbours ({eight.spread():.3f} with the mean frame).",
             mirrored_eight.spread() < 1e-6,
-            "four neighbours (`paper/a` with `frame: {type: mirror}`), which have no convexity "
-            "without it either",
+            "four neighbours (`paper/a` with `frame: {type: mirror}`); with four neighbours the "
+            "mean frame does not cause a convexity either",
             mirrored.spread() < 1e-12,
         ),
         Claim(
@@ -155,9 +155,9 @@ def _energy() -> list[Claim]:
         ),
         Claim(
             "decrease in quite a parabolic-like way",
-            f"{both_text(of_67, peak)}. At the end PE1 decreases by a constant fraction per step, "
-            f"{1 - tail[1] / tail[0]:.1%} at step 150 and {1 - tail[-1] / tail[-2]:.1%} at the "
-            "last step, as an exponential does.",
+            f"{both_text(of_67, peak)}. At the end, PE1 decreases like an exponential: by a "
+            f"constant fraction per step, which is {1 - tail[1] / tail[0]:.1%} at step 150 and "
+            f"{1 - tail[-1] / tail[-2]:.1%} at the last step.",
             parabolic(both(of_67, peak, 400)),
             f"steps {peak} to 150 of the decrease",
             parabolic(both(of_67, peak, 150)),
@@ -209,9 +209,9 @@ def _history() -> list[Claim]:
         ),
         Claim(
             "no oscillation can be observed with this kind of rule",
-            f"x of particle 67 changes direction {turns} time after it starts to move and never "
-            f"crosses its rest position; in `paper/a-memory` it crosses it {crossings} times by "
-            "step 200.",
+            f"The direction of the motion of particle 67 along x changes {turns} time, and the "
+            "particle never crosses its rest position; in `paper/a-memory` it crosses this "
+            f"position {crossings} times by step 200.",
             turns == 1 and bool((x >= 0).all()),
         ),
     ]
@@ -232,9 +232,10 @@ def _setting() -> list[Claim]:
         ),
         Claim(
             "points are numbered from left to right and from bottom to up",
-            "According to the paper 67 is a central point above the central line. Numbered row by "
-            f"row it would be in column {row_wise[0] + 1}, row {row_wise[1] + 1} of 10, below that "
-            f"line; numbered column by column it is in column {column + 1}, row {row + 1}.",
+            "According to the paper, particle 67 is a central point above the central line. If "
+            f"particles are numbered row by row, it is in column {row_wise[0] + 1}, row "
+            f"{row_wise[1] + 1} of 10, below that line. If they are numbered column by column, it "
+            f"is in column {column + 1}, row {row + 1}.",
             row_wise[1] > 4,
             "numbers that increase column by column",
             row == 5,

@@ -67,10 +67,10 @@ def _line() -> list[Claim]:
         Claim(
             "choosing a distance fracture of about 10 units",
             "The lengths of bonds are tested after leaders have moved and before followers move. "
-            f"The longest bond is then {fast:.2f} if the leaders move by 1.2 per step (in step "
-            f"{at}), and {slow:.2f} if they move by 0.35. Therefore no bond breaks at a "
-            f"threshold of 10; the sheet separates at thresholds up to {fast:.2f}. For a bond to "
-            "break "
+            f"If the leaders move by 1.2 per step, the largest length then occurs in step {at} "
+            f"and is {fast:.2f}; if they move by 0.35 per step, the largest length is {slow:.2f}. "
+            "Therefore no bond breaks at a threshold of 10; the sheet separates at thresholds up "
+            f"to {fast:.2f}. For a bond to break "
             f"at a threshold of 10, the leaders would have to move until step {late}.",
             max(fast, slow) > 10,
             "leaders that move by 1.2 per step for twenty steps instead of ten",
@@ -116,10 +116,11 @@ def _line() -> list[Claim]:
             "time (1, 5, 6, 7 and 100) … (1, 5, 6, 7, 8 and 100) [when it tears]",
             f"The rows separate at time {span('d1')} in `paper/d1` and {span('d2')} in "
             f"`paper/d2`. Thresholds from {TRIED[0]:g} to {TRIED[-1]:g} were tried in steps of "
-            "0.1. A threshold agrees with the figures if the last row separates after time 5 and "
-            "not later than time 7 in `paper/d1` and time 8 in `paper/d2`. The thresholds "
-            f"{which(fitting('d1', 'd2'))} do. At a threshold of 6 the rows separate at time "
-            f"{_times('d1', 6.0)} in `paper/d1` and {_times('d2', 6.0)} in `paper/d2`.",
+            "0.1. A threshold agrees with the figures if the last row separates after time 5 in "
+            "both cases, not later than time 7 in `paper/d1`, and not later than time 8 in "
+            f"`paper/d2`. The thresholds {which(fitting('d1', 'd2'))} agree. At a threshold of 6 "
+            f"the rows separate at time {_times('d1', 6.0)} in `paper/d1` and {_times('d2', 6.0)} "
+            "in `paper/d2`.",
             5.2 in fitting("d1", "d2"),
         ),
     ]
@@ -182,7 +183,8 @@ def _rebound() -> list[Claim]:
             "If bonds to the frame do not break, there is "
             f"{'one' if tied_one else 'no'} rebound with one shell, and one with two shells.",
             rebound(x_of(one)) is None and rebound(x_of(two)) is not None,
-            "`paper/d2-frame-bonds` against `paper/d1` with `frame_bonds: false`",
+            "`paper/d2-frame-bonds`, when it is compared with a run of `paper/d1` that has "
+            "`frame_bonds: false`",
             tied_one is None,
         ),
         Claim(

@@ -104,22 +104,22 @@ def _one_shell() -> list[Claim]:
         Claim(
             "this results in a concave final surface",
             f"The outer rows of the torn surface are {dent(f1):.2f} farther right than its "
-            f"middle rows. Of the thresholds {which(list(family))} this difference exceeds 0.3 at "
-            f"{which(dented)}.",
+            f"middle rows. This difference exceeds 0.3 at the thresholds {which(dented)}. The "
+            f"thresholds {which(list(family))} were tried.",
             dent(f1) > 0.3,
         ),
         Claim(
             "a rebound mechanism [of 133] can be outlined",
             f"x of particle 133 decreases to {back[1]:.3f} at step {back[0]} and then increases to "
-            f"{back[2]:.3f}. Of the thresholds {which(list(family))} there is a rebound at "
-            f"{which(turning)}.",
+            f"{back[2]:.3f}. There is a rebound at the thresholds {which(turning)}. The thresholds "
+            f"{which(list(family))} were tried.",
             back[0] > 10,
         ),
         Claim(
             "in the square lattice this [rebound] behaviour does not exist",
-            "Figure 16 of the paper shows a rebound. Here there is none in `paper/d1` and "
-            f"`paper/d2`, but one in `paper/d2-frame-bonds`, from {back_square[1]:.3f} to "
-            f"{back_square[2]:.3f}.",
+            "Figure 16 of the paper shows a rebound. There is none in the runs of "
+            "`paper/d1` and `paper/d2`. In `paper/d2-frame-bonds` the x displacement of particle "
+            f"103 decreases to {back_square[1]:.3f} and then increases to {back_square[2]:.3f}.",
             not any(square.values()),
             "`paper/d1` and `paper/d2`, but not with `paper/d2-frame-bonds`",
             not (square["d1"] or square["d2"]),
@@ -159,16 +159,17 @@ def _two_shells() -> list[Claim]:
         ),
         Claim(
             "no rebound [of 133]",
-            "In `paper/f2` x decreases monotonically after the fracture. Of the thresholds "
-            f"{which(list(family))} there is a rebound at {which(turning)}.",
+            "In `paper/f2` x decreases monotonically after the fracture. There is a rebound at a "
+            f"threshold of {which(turning)}. The thresholds {which(list(family))} were tried.",
             rebound(x_of(f2)) is None,
         ),
         Claim(
             "the equilibrium configuration, after the fracture, is similar to the original",
             f"The largest displacement at step 400 of a piece 9 wide is {f2.residual():.2f} in "
             f"`paper/f2`, where frame points hold it, {early.residual():.3f} in `paper/f2-early` "
-            f"(thresholds 5) and {cusped.residual():.3f} in `paper/f2-cusp`. Of the thresholds "
-            f"{which(list(family))} it is below 0.1 at {which(near)}.",
+            f"(thresholds 5) and {cusped.residual():.3f} in `paper/f2-cusp`. It is below "
+            f"0.1 at the thresholds {which(near)}. The thresholds {which(list(family))} were "
+            "tried.",
             f2.residual() < 0.1,
             "`paper/f2-early` or `paper/f2-cusp`",
             max(early.residual(), cusped.residual()) < 0.1,
@@ -184,13 +185,13 @@ def _two_shells() -> list[Claim]:
         ),
         Claim(
             "cuspidal point in X coordinate [of 133], after about 100 step",
-            "There is no cusp in `paper/f2`, and none in `paper/f2-second-fracture`: the second "
-            f"difference of x in time is at most {kink:.1g} near step {second}, because the bond "
-            "that breaks in this step does not belong to the piece. In `paper/f2-cusp` (thresholds "
-            "5.1) a bond between the "
-            f"piece and the frame breaks at step {cusp}, and twenty steps later x of particle 133 "
-            f"decreases {bend:.1f} times as fast as before. {searched} thresholds from 4.9 to 5.3 "
-            "were tried; a bond of the piece breaks between steps 60 and 150 at the thresholds "
+            "There is no cusp in `paper/f2`. There is none in `paper/f2-second-fracture` either, "
+            f"because the bond that breaks at step {second} does not belong to the piece: near "
+            "this step the second time difference of the x coordinate of particle 133 is at most "
+            f"{kink:.1g}. In `paper/f2-cusp` (thresholds 5.1) a bond between the piece and the "
+            f"frame breaks at step {cusp}. Twenty steps later, the x coordinate decreases "
+            f"{bend:.1f} times as fast as before. {searched} thresholds from 4.9 to 5.3 were "
+            "tried. A bond of the piece breaks between steps 60 and 150 at the following ones: "
             f"{which(felt)}.",
             False,
             "`paper/f2-cusp`",

@@ -39,11 +39,11 @@ def _shared() -> Claim:
     gains = {r["size"]: r["one_ns"] / r["two_ns"] for r in rows if r["rule"] == "barycentre"}
     return Claim(
         "the job can be parallelized between the GPU cores",
-        "Nothing was measured on a GPU. Every follower is computed from the intermediate "
-        "configuration alone, so that the work can be divided in any way; two threads of a "
-        f"processor give the same positions (difference in case a: {differ:g}). For sheets of "
-        "the size in brackets two threads are "
-        f"{', '.join(f'{g:.2f} ({n}²)' for n, g in gains.items())} times as fast as one "
+        "Nothing was measured on a GPU. Every follower is computed only from the intermediate "
+        "configuration. Therefore the followers can be distributed among threads in any way: two "
+        f"threads of a processor give the same positions (difference in case a: {differ:g}). The "
+        "time on one thread divided by the time on two threads is "
+        f"{', '.join(f'{g:.2f} ({n}² particles)' for n, g in gains.items())} "
         "([performance](performance.md#threads)).",
         False,
         "threads of a processor, in sheets of "

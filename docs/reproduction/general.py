@@ -37,9 +37,9 @@ def section() -> Section:
                 "stiffness.png",
                 ylim=(0.2, 2.05),
             ),
-            "Stiffness for waves along x. The lines of 4 and 8 neighbours coincide: the paper's "
-            "second shell has no effect. 24 neighbours (the lowest line) soften short waves more "
-            "than 4 neighbours do; gradient elasticity with l² > 0 stiffens them",
+            "Stiffness for waves along x. The curves for 4 and for 8 neighbours coincide, because "
+            "the paper's second shell has no effect. 24 neighbours (the lowest curve) soften "
+            "short waves more than 4 neighbours do; gradient elasticity with l² > 0 stiffens them",
         )
     ]
     words = "Claims of the introduction, sections 3 and 5 and the conclusions that can be tested."
@@ -141,11 +141,11 @@ def _rules() -> list[Claim]:
         ),
         Claim(
             "anisotropic elastic behaviour",
-            "Only the diffusivity is anisotropic. With the neighbours of the previous claim the "
-            "largest displacement along y that a displacement along x causes is "
-            f"{signs['cross']:.1g}. A displacement along y spreads exactly as one along x does "
-            f"(difference at most {signs['turned']:.0e}). Both are properties of diffusion: in an "
-            "elastic body extension and shear would be coupled and have different stiffnesses.",
+            "Only the diffusivity is anisotropic. With weighted Euclidean neighbours, as in "
+            "the previous claim, a displacement along x causes no displacement along y (largest "
+            f"value {signs['cross']:.1g}). A displacement along y spreads exactly as one along x "
+            f"does (difference at most {signs['turned']:.0e}). Diffusion has these two properties; "
+            "in an elastic body, extension and shear are coupled and have different stiffnesses.",
             max(signs.values()) > 1e-6,
         ),
     ]
@@ -182,10 +182,10 @@ def _shape() -> list[Claim]:
     return [
         Claim(
             "without the frame … this point will be attracted toward the inside and collapse",
-            "With the barycentre rule and no frame the height of a sheet at rest decreases from 9 "
-            f"to {sizes[1]:.2f} after 10 steps, {sizes[2]:.2f} after 100 and {sizes[3]:.1g} after "
-            "400. With mean-displacement, the paper's first example of a rule, the sheet stays at "
-            f"rest (displacement {np.abs(mean.u).max():.1g}).",
+            "With the barycentre rule and no frame, a sheet without leaders that move collapses: "
+            f"its height decreases from 9 to {sizes[1]:.2f} after 10 steps, {sizes[2]:.2f} after "
+            f"100 and {sizes[3]:.1g} after 400. With mean-displacement, the paper's first example "
+            f"of a rule, the sheet stays at rest (displacement {np.abs(mean.u).max():.1g}).",
             sizes[3] < 0.1,
         ),
         Claim(
@@ -219,7 +219,7 @@ def _shape() -> list[Claim]:
         ),
         Claim(
             "a change in their position produces … contraction or loosening of the lattice",
-            "The strain of the piece at the clamp converges to "
+            "The strain of the piece that remains clamped converges to "
             f"{stays[0.8][1]:.4f} for λ = 0.8, {stays[1.0][1]:.4f} for 1 and "
             f"{stays[1.2][1]:.4f} for 1.2 ([figures](anisotropy-and-plasticity.md)).",
             max(stays[0.8]) < -0.1 < 0.1 < min(stays[1.2]) and max(map(abs, stays[1.0])) < 1e-3,

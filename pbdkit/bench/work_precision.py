@@ -57,9 +57,10 @@ if TYPE_CHECKING:
 def resized(experiment: Experiment, size: int) -> tuple[str, ...]:
     """Return the settings with which about `size` sites lie along the longer side of the body.
 
-    A grid gets `size` columns and rows in proportion; positions are scaled with the body. For any
-    other body the lattice constant is changed. Lengths that are given in lattice constants, such as
-    thresholds and the radius of neighbours, are changed accordingly.
+    If the body is a grid, it gets `size` columns, and its number of rows is changed in proportion;
+    positions are scaled with the body. For any other body the lattice constant is changed. Lengths
+    that are given in lattice constants, such as thresholds and the radius of neighbours, are
+    changed accordingly.
 
     Raises
     ------

@@ -285,7 +285,8 @@ def status(**options: Any) -> None:
 def explain(**options: Any) -> None:
     """Explain fracture: which bonds broke, when, at which strain and in which order.
 
-    For one bond, report its distance from breaking, or its break, and what happened around it.
+    For one bond, report how close it is to breaking or how it broke, and what happened around
+    it.
     """
     call("result:explain", **options)
 

@@ -32,7 +32,8 @@ MAX_LISTED = 20
 def explain(file: Path, bond: tuple[int, int] | None, at: dict[str, str], as_json: bool) -> None:
     """Explain fracture: which bonds broke, when, at which strain and in which order.
 
-    For one bond, report its distance from breaking, or its break, and what happened around it.
+    For one bond, report how close it is to breaking or how it broke, and what happened around
+    it.
     """
     with waiting(f"reading {file}", silent=as_json), reading(file, at=at) as dataset:
         explained = BondRecords(dataset, scene_of(dataset, "explain"))

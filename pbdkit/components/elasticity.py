@@ -302,9 +302,11 @@ class CellElastic(MixesCells, TearsCells, Loadable, FollowerRule):
 
     @abstractmethod
     def material(self) -> tuple[float, Stiffness]:
-        """Return a modulus divided by Young's modulus, and the stiffness divided by that modulus.
+        """Return a reference modulus divided by Young's modulus, and the stiffness divided by the
+        reference modulus.
 
-        The ratios in the stiffness are finite for every admissible material.
+        The reference modulus is chosen so that the ratios in the stiffness are finite for every
+        admissible material.
         """
 
     def elasticity(self) -> Stiffness | None:

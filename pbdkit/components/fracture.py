@@ -339,7 +339,8 @@ class Damage(Draws, Softens, RenewsBonds, BreaksAtStrain, Parting):
         return self
 
     def constants(self, slot: Slot) -> dict[str, float]:
-        """Return `per_rest` = 1/|r|, and without scatter `onset_strain` and `failure_strain`."""
+        """Return `per_rest` = 1/|r| and, if there is no scatter, also `onset_strain` and
+        `failure_strain`."""
         strains = {} if self.scatter else self._strains()
         return {"per_rest": 1.0 / length(slot.rest)} | strains
 

@@ -139,8 +139,8 @@ def galerkin(code, stencils, coarse, halved, out):
 
 @njit(cache=CACHED)
 def asymmetry(code, stencils):
-    """Return the largest entry of K - Kᵀ. Of the places with the most frequent stencil, one pair of
-    neighbours in each direction is sufficient."""
+    """Return the largest entry of K - Kᵀ. All places with the most frequent stencil have equal
+    entries, so that only one pair of these places is compared in each direction."""
     worst, is_checked, unchecked = 0.0, np.zeros(9, np.bool_), 9
     for i in range(1, code.shape[0] - 1):
         for j in range(1, code.shape[1] - 1):
@@ -318,7 +318,8 @@ def differences(still, moved, place, number, share, axis, out):
 
 @njit(**FAST)
 def clear_noise(stencils, noise):
-    """Set the four numbers of a place of a stencil to zero if all are at most `noise`."""
+    """Set the entries of stencils to zero. This is done for each block (axis, axis) in which no
+    magnitude exceeds `noise`."""
     for n in range(stencils.shape[0]):
         for s in range(stencils.shape[1]):
             c = stencils[n, s]

@@ -88,7 +88,7 @@ def compliance(grids: Multigrid | PartedGrids) -> float:
 
 
 def field_of(matrix: StencilMatrix, planes: Floats) -> Floats:
-    """Return planes of the scene as a field of the grid."""
+    """Return the rasters of a displacement in the scene as a field of the grid."""
     if matrix.at is None:
         return planes.reshape(2, *matrix.code.shape)
     out = np.zeros((2, *matrix.code.shape))
@@ -97,12 +97,14 @@ def field_of(matrix: StencilMatrix, planes: Floats) -> Floats:
 
 
 def free_field_of(matrix: StencilMatrix, planes: Floats) -> Floats:
-    """Return planes of the scene as a field that is zero except at free places."""
+    """Return the rasters of a displacement in the scene as a field that is zero except at free
+    places."""
     return np.where(matrix.code >= 0, field_of(matrix, planes), 0.0)
 
 
 def planes_of(matrix: StencilMatrix, field: Floats, shape: tuple[int, ...]) -> Floats:
-    """Return a field of the grid as planes of the scene, which have the given shape."""
+    """Return the values of a field of the grid in an array of the given shape, which has a raster
+    of the scene for each axis."""
     if matrix.at is None:
         return field.reshape(shape)
     planes = np.zeros(shape)

@@ -159,7 +159,7 @@ class _Replaceable(System):
 
     @property
     def bound_kind(self) -> str:
-        """Kind of the bound of the current system."""
+        """Kind of the error bound that the current system gives."""
         return self._system.bound_kind
 
     @property

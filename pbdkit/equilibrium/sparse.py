@@ -206,8 +206,8 @@ class ConstrainedSubsystem(Subsystem):
     def solve(
         self, r: Floats, invariant_change: Floats | None = None, rounding: float = 0.0
     ) -> Floats:
-        """Return the solution by the method; `invariant_change` is not used, since a part that is
-        held has no invariants."""
+        """Return the solution by the method of the linear solver; `invariant_change` is not used,
+        since a part that is held has no invariants."""
         if not r.any():
             return np.zeros_like(r)
         self._watch.begin("solving")
@@ -290,7 +290,7 @@ class SingularSubsystem(Subsystem):
     def solve(
         self, r: Floats, invariant_change: Floats | None = None, rounding: float = 0.0
     ) -> Floats:
-        """Return the solution by the method."""
+        """Return the solution of the bordered system."""
         if self._solver is None:
             if r.any():
                 raise TooSoftError
@@ -307,8 +307,8 @@ class SingularSubsystem(Subsystem):
         return x
 
     def solve_transposed(self, weights: Floats) -> Floats:
-        """Return the solution of the transposed system; loads that the part does not balance have
-        no effect."""
+        """Return the solution of the transposed system. Only the part of the load that is in
+        balance has an effect, because nothing holds the floating part."""
         if self._solver is None:
             return np.zeros_like(weights)
         b = np.append(weights, np.zeros(self._borders))

@@ -509,7 +509,7 @@ class Peaks(Strict):
 def _peaks_of_curves(rows: Floats, quantity: str) -> Floats:
     """Return the largest force of each specimen, or the displacement at this force.
 
-    The other values of the row of the file are returned too.
+    The remaining columns of the row with the largest force are returned too.
     """
     peaks = []
     for specimen in np.unique(rows[:, 0]):

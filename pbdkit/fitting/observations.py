@@ -5,10 +5,11 @@ prescribed, their noise would be prescribed too. The displacement of each leader
 motion `measured` is therefore a polynomial along the boundary. Its coefficients are estimated
 together with all other unknowns, starting from the measured values.
 
-Displacements between particles are interpolated bilinearly in the cells of the lattice. Derivatives
-of predictions of a run are central differences of order 8 of whole runs, in which the same bonds
-must break. If a run ends in equilibrium, the runs for the differences make the same number of
-steps, because the number of steps to equilibrium is not a smooth function of the parameters.
+Displacements between particles are interpolated bilinearly in the cells of the lattice. The
+predictions of a run are differentiated by central differences of order 8. For these differences the
+whole run is repeated with modified parameters, and the same bonds must break in all runs. If the
+first run ends in equilibrium, the other runs make the same number of steps, because the number of
+steps to equilibrium is not a smooth function of the parameters.
 """
 
 from __future__ import annotations
@@ -304,7 +305,8 @@ def _are_in_cells(scene: Scene, triangles: Indices) -> NDArray[np.bool_]:
 
 
 def _is_torn(scene: Scene, interpolation: Interpolation) -> NDArray[np.bool_]:
-    """Return whether a bond between particles around each point inside is broken from the start."""
+    """Return for each point inside the body whether a bond between the particles around it is
+    broken from the start."""
     broken, bonds = initial_state(scene).broken_step, scene.bonds
     assert broken is not None
     torn = broken.reshape(len(broken), -1)[bonds.plane, bonds.place] >= 0
@@ -510,8 +512,8 @@ class Observation(ABC):
 
     @property
     def weighted_noise(self) -> float:
-        """Return the noise divided by the square root of the weight, by which residuals are
-        divided."""
+        """Return the noise divided by the square root of the weight. Residuals are divided by this
+        quotient."""
         return float(self.noise / np.sqrt(self.weight))
 
     @property
@@ -895,8 +897,8 @@ class FieldPrediction(Prediction):
     changes
         Derivatives of the displacements with respect to the parameters, as rasters.
     answers
-        Derivatives with respect to the coefficients of boundaries. They can be those of another
-        equilibrium with similar parameters.
+        Derivatives of the displacements with respect to the coefficients of boundaries. They can be
+        those of another equilibrium with similar parameters.
     answering
         The equilibrium at which `answers` were computed.
     away

@@ -370,6 +370,6 @@ def along(
 
 
 def _bonds(state: State) -> list[Floats]:
-    """Copy the state of bonds that can change."""
+    """Copy those arrays of the state that belong to bonds and can change."""
     arrays = [] if state.broken_step is None else [state.broken_step.copy()]
     return [*arrays, *(value.copy() for value in state.bond_values)]

@@ -499,7 +499,7 @@ class WeightedSamples:
 
 
 class StrengthLaw(ABC):
-    """A distribution of strengths with two parameters, at the `paths` of an experiment."""
+    """A distribution of strengths with two parameters. `paths` are their paths in an experiment."""
 
     paths: ClassVar[tuple[str, str]]
 
@@ -813,7 +813,8 @@ class FittedStrength:
     draws: WeightedSamples = field(kw_only=True, repr=False)
 
     def with_check(self, checked: Checked | None) -> FittedStrength:
-        """Return the result with a test whether specimens fail when their first bond breaks."""
+        """Return the result, completed by the test of whether specimens fail when their first bond
+        breaks."""
         return replace(self, checked=checked)
 
     def as_dict(self) -> dict[str, Any]:
@@ -1018,7 +1019,7 @@ class PeakDistribution:
 def fit_by_simulation(
     fit: StrengthFit, experiment: Experiment, specimens: Specimens
 ) -> WeightedSamples:
-    """Sample strengths that agree with the measured peaks.
+    """Draw samples of the strength parameters that agree with the measured peaks.
 
     They lie between the bounds, and the prior density of their logarithms is constant.
 

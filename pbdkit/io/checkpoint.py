@@ -161,10 +161,10 @@ def _is_consistent(
 
 
 def _is_like(facts: Any, template: Any) -> bool:
-    """Return whether facts have the same types as a template, which contains the facts of a run
-    before its first step.
+    """Return whether the entries of a checkpoint have the same types as those of a template, which
+    describes a run before its first step.
 
-    Where the template has None, the facts may have a number, an array, or a list of numbers.
+    Where the template has None, the checkpoint may have a number, an array, or a list of numbers.
     """
     if isinstance(template, dict) and "array" not in template:
         same_keys = isinstance(facts, dict) and facts.keys() == template.keys()

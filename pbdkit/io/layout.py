@@ -161,9 +161,9 @@ def _flags(meanings: dict[str, Any]) -> dict[str, Any]:
 
 def optional_columns() -> list[list[Column]]:
     """Return the columns that depend on the experiment, but not on its diagnostics. These are the
-    table of bonds with the steps in which they broke, and two kinds of coordinates: the coordinate
-    of quantities that are measured at every step, and the coordinates of leader groups, loads,
-    obstacles and principal values."""
+    columns of the table of bonds, with the step in which each bond broke, and two kinds of
+    coordinates: the coordinate of quantities that are measured at every step, and the coordinates
+    of leader groups, loads, obstacles and principal values."""
     bond, by_ends = ("bond",), "counted from 1, by its ends"
     whole = "-1 where it has not broken"
     no_strain = "NaN where it has not broken, was cut, or was broken from the start"

@@ -1,4 +1,4 @@
-"""Selection of one member of the dataset of a sweep by its parameters."""
+"""Selection of one member of a sweep in its dataset, by the parameters of the member."""
 
 from __future__ import annotations
 

@@ -85,8 +85,8 @@ class RunStore:
         """Open a store; `mode` is ro, rw, or rwc to create it.
 
         With ro nothing on the disk is changed, even if the store is damaged. With rw SQLite would
-        discard a damaged log. Therefore `check` is called and the header of the records is verified
-        before.
+        discard a damaged log. Therefore `check` must be called, and the header of the records be
+        verified, before a store is opened with rw.
         """
         self.path, self._writes = path, mode != "ro"
         self.identity, self.commits = b"", 0

@@ -72,7 +72,7 @@ def lost_stress(scene: Scene, state: State, u: Floats, cells: list[tuple[Patch, 
     over the given cells around it, weighted by their area fractions.
 
     In a cell it is -Σ ΔF ⊗ X over its corners, divided by its area, where ΔF is the change of the
-    force on a corner that damage causes. This is the formula for the mean stress of a body with
+    force on a corner because of damage. This is the formula for the mean stress of a body with
     forces on its surface.
     """
     total, area = np.zeros((4, *scene.raster.shape)), np.zeros(scene.raster.shape)

@@ -84,7 +84,8 @@ class Patch:
         return bonds
 
     def rows(self, raster: Raster, place: int) -> Indices:
-        """Return the rows of the corners of the cell at a flat place of the patch."""
+        """Return, for the corners of one cell, their rows in the particle table. `place` is the
+        flat place of the cell in the patch."""
         s = np.array([block.sublattice for block in self.corners])
         start = np.array([block.start for block in self.corners])
         return raster.rows_at(s, *np.add(start, np.unravel_index(place, self.whole.shape)).T)
@@ -125,8 +126,9 @@ class WeighedCells:
     tiling
         Cells of the lattice.
     share
-        Area fraction of each cell inside the outline, 0 to 1, (kind, sublattice, cell, cell), at
-        the place of its first corner. None if all cells are whole.
+        Area fraction of each cell inside the outline, from 0 to 1, stored at the place of the first
+        corner of the cell. The shape is (kind, sublattice, cell, cell). None if all cells are
+        whole.
     weight
         Area fraction of each cell, times the ratio of the stiffness of the cell to the stiffness of
         the rule; 0 for the cells in `mixed`.
@@ -139,7 +141,7 @@ class WeighedCells:
         Number of the material of each cell, and -1 for a cell that contains several materials. None
         if there is only one material.
     names
-        Name of the component of stiffness that each of the stiffnesses stands for.
+        For each array of `mixed`, the name of the component of the elastic stiffness.
     """
 
     tiling: Tiling

@@ -47,16 +47,17 @@ after the step."""
 
 
 def derivative(moved: Moved, shape: tuple[int, ...], unit: float) -> NDArray[np.float64]:
-    """Differentiate a function of a step at a step of zero. The result is (component, *shape).
+    """Differentiate a function of a displacement at zero displacement. The result has the shape
+    (component, *shape).
 
     Parameters
     ----------
     moved
-        Function of the step, in units of `unit`.
+        Function of the displacement. Its values are vectors.
     shape
         Shape of its components.
     unit
-        Length with which the sizes of steps are multiplied.
+        Length by which the small displacements of the differentiation are multiplied.
     """
     small, tiny = SMALL * unit, TINY * unit
     with np.errstate(all="ignore"):

@@ -195,8 +195,8 @@ class Driven(Strict):
         return last + 1
 
     def events(self, steps: int) -> list[int]:
-        """Return the steps of a run in which the motion begins or comes to rest, or after which it
-        ends."""
+        """Return the steps of a run in which the motion begins or comes to rest, and the first step
+        in which the motion no longer acts."""
         first, last = self.from_, self.last(steps)
         if first > steps:
             return []

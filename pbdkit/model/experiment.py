@@ -510,7 +510,8 @@ class Experiment(Strict):
 
     @model_serializer(mode="wrap")
     def _with_origins(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """Serialize with the distribution of types that several distributions provide."""
+        """Serialize the experiment. If several distributions provide a type, its name is written
+        with the distribution."""
         result: dict[str, Any] = serialize(self)
         if not result.keys() >= INTERFACES.keys():
             return result  # Only some fields are serialised.

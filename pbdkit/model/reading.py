@@ -79,8 +79,8 @@ class FileResolver:
         Raises
         ------
         ValueError
-            If the name is not a file name, or if the file does not exist or, after links are
-            resolved, lies outside the folder without permission.
+            If the name is not a file name, or if the file does not exist. Also if the file lies
+            outside the folder, after links are resolved, and files outside are not permitted.
         """
         if not isinstance(name, str) or not name or "\0" in name:
             raise ValueError(f"expected the name of a {what} file, got {name!r:.40}")

@@ -336,9 +336,9 @@ def _depth(parts: int) -> int:
 
 
 def _margin(scene: Scene) -> int:
-    """Return the number of outermost rows of a part that cannot be used in the system. These are
-    the empty rows, the rows that do not move, and the rows that have such rows, or frame points
-    that follow them, as neighbours."""
+    """Return the number of outermost rows of a part that cannot be used in the system. Some of
+    these rows are empty or do not move. In the others, a particle has a neighbour that lies in such
+    a row or that is a frame point following such a row."""
     return 3 * reach_of(scene, 0).reach + partition.farthest_apart(scene)
 
 

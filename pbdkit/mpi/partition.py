@@ -133,7 +133,7 @@ class Subdomain:
 
     def cut(self, array: Array, axes: int) -> Array:
         """Return a copy of the rows of this subdomain from an array of the whole lattice. The last
-        `axes` axes of the array are cells."""
+        `axes` axes of the array are those of repeat cells."""
         return row_view(array, axes, slice(self.low, self.high)).copy()
 
     def seen(self, rows: int) -> tuple[int, int]:
@@ -451,8 +451,8 @@ class RowCount:
     `low` and `high` are the smallest and the largest site index of the body. `lines` are the
     numbers of particles on each line of sites, including the frame, beginning with the first line
     that is not empty. `period` is the number of site indices in a repeat cell along the first axis,
-    and `reach` the number of repeat cells that neighbours reach along it. `left_out` are the cells
-    omitted at narrow voids.
+    and `reach` the number of repeat cells that neighbours reach along it. `left_out` describes the
+    cells that are omitted at narrow voids.
     """
 
     low: Index

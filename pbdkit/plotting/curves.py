@@ -191,7 +191,7 @@ class Line:
 
 
 def new_axes(width: float = SIZE_IN[0], height: float = SIZE_IN[1]) -> Axes:
-    """Return the axes of a new figure of a size in inches."""
+    """Return the axes of a new figure. `width` and `height` are in inches."""
     return new_figure(figsize=(width, height), dpi=DPI, layout="constrained").add_subplot()
 
 

@@ -378,8 +378,8 @@ class _Drawing:
 
 
 def _pixels(vector: Floats, longest: float) -> Floats:
-    """Return the vector of an arrow for a displacement, in pixels. The longest arrow has ARROW
-    pixels. Without displacement the result is zero."""
+    """Return the vector of an arrow for a displacement, in pixels. The longest arrow has a length
+    of MAX_ARROW_PX. Without displacement the result is zero."""
     length = float(np.hypot(*vector))
     if length <= 1e-12 * longest or longest == 0.0:
         return np.zeros(2)

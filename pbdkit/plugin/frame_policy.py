@@ -164,5 +164,6 @@ class FramePolicy(Component):
 class Anchors:
     """Frame that fixes the body in space: moves change if the body is translated.
 
-    With all other frames the weights of each frame point sum to 1, and moves do not change.
+    With all other frames the weights of each frame point sum to 1, so that a translation does not
+    change moves.
     """

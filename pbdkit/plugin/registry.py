@@ -184,7 +184,8 @@ class Registry:
 def _offers(
     plugins: Iterable[Plugin], interface: type[Component] | None, name: str | None = None
 ) -> list[tuple[Plugin, Offer]]:
-    """Return the offers for an interface, optionally for one type only, including unusable ones."""
+    """Return the offers (components that plugins provide) for an interface, optionally for one type
+    only. Unusable ones are included."""
     offers = [(plugin, o) for plugin in plugins for o in plugin.offers if o.interface is interface]
     return [(plugin, o) for plugin, o in offers if name in (None, o.name)]
 

@@ -322,7 +322,8 @@ class StoresEnergy(Calibrated):
     @staticmethod
     @abstractmethod
     def energy(d: Vector, r: Vector, w: Weights, p: Parameters) -> Number:
-        """Return the share of this end, one half, in the strain energy of a bond, elementwise.
+        """Return half of the strain energy of a bond, elementwise. The function is evaluated at
+        both ends of a bond.
 
         Parameters
         ----------

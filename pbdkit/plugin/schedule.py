@@ -63,7 +63,8 @@ class TimeDependent(Strict, Generic[Value]):
                 "the largest value": max(values)}  # fmt: skip
 
     def at(self, moment: float) -> float:
-        """Return the value at the end of a step or, for a fractional number, within it."""
+        """Return the value at the end of a step. A fractional step number gives a value within a
+        step."""
         return float(np.interp(moment, self.steps, self._values))
 
     @cached_property

@@ -107,8 +107,8 @@ def check_diagnostics(
     Raises
     ------
     ExperimentError
-        If a diagnostic requires something that the scene does not have, or two declare one
-        variable.
+        If a diagnostic requires something that the scene does not have, or if two diagnostics
+        declare the same variable.
     """
     owners = remembered_names(experiment)
     for n, diagnostic in enumerate(experiment.diagnostics):

@@ -403,8 +403,8 @@ class Analysis:
         """Return the distance of the body from its equilibrium in the steps in which its leaders
         move fastest.
 
-        None if no leader moves steadily, if steps diverge or are not made, or if it would take too
-        long.
+        The result is None if no leader moves steadily, if steps diverge, if the solver makes no
+        steps, or if the computation would take too long.
         """
         if not (self.scene.experiment.solver.makes_steps and self.stable):
             return None

@@ -368,8 +368,9 @@ class PushOut(Operation):
         return [at for each in self.scene.barriers for at in each.group.events(steps)]
 
     def hindrance(self, mode: Mode) -> Hindrance | None:
-        """Return a reason if state variables change, because the response of particles is computed
-        from the initial values of the state variables."""
+        """Return the reason why obstacles that push do not support a mode. Kernels do not support
+        them if parameters change in time, because the response of particles is computed once, from
+        initial values."""
         reasons = {
             Mode.GPU: "obstacles push",
             Mode.TIME_DEPENDENT: PUSHED_BY_TIME_DEPENDENCE,

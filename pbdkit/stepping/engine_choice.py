@@ -1,4 +1,4 @@
-"""Choice of the engine and the number of threads for a scene, with the reason of the choice.
+"""Choice of the engine and the number of threads for a scene, with the reason for the choice.
 Engines that are not chosen are not imported."""
 
 from __future__ import annotations

@@ -138,8 +138,8 @@ class SlotFollowers(Followers):
         return -0.5 * float((u * forces).sum())
 
     def _seen(self, m: Floats, state: State) -> Floats:
-        """Return the vectors of which the rule receives differences: displacements, or the moves of
-        its inner rule."""
+        """Return the vectors that enter the rule by their differences between neighbours. They are
+        the displacements or, if the rule has an inner rule, the moves of the inner rule."""
         if self._inner is None:
             return m
         z = self._inner.moves(m, state)

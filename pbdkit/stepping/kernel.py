@@ -71,7 +71,7 @@ class KernelWriter(ABC):
 
     @abstractmethod
     def vector(self, pattern: str) -> str:
-        """Return a vector of components that follow the pattern."""
+        """Return a vector expression. Its components are given by the pattern for each axis."""
 
     @abstractmethod
     def number(self, value: float) -> str:

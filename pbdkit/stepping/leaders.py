@@ -162,8 +162,8 @@ class Guidance:
         return slants
 
     def shares(self, guided: Guided) -> Floats:
-        """Return S_ff⁻¹ S_fl, (particle, free axis, led axis); it is zero for all other pairs of
-        axes."""
+        """Return an array of shape (particle, axis, axis). It contains S_ff⁻¹ S_fl for the pairs of
+        a free axis f and a led axis l, and zero for all other pairs of axes."""
         axes = self._scene.axes
         shares = np.zeros((len(guided.place), axes, axes))
         if not self.slanted or not len(guided.place):
@@ -407,8 +407,8 @@ class PlaceLeaders(LeaderOperation):
         ]
 
     def end_pass(self, kernel: KernelWriter) -> None:
-        """Write lines that place the leaders as prescribed in the last step but one, because these
-        displacements are read after the pass."""
+        """Write lines that place the leaders as prescribed in the last step but one, because the
+        displacements in that step are read after the pass."""
         for end, axes in self.endings.items():
             lines = kernel.each(f"flat_v_@[leaders{end}[e]] = target{end}[#, e]", axes)
             kernel.listed(f"leaders{end}", *lines)
@@ -517,8 +517,9 @@ class GuideLeaders(LeaderOperation):
             kernel.listed(f"leaders{end}", *lines)
 
     def hindrance(self, mode: Mode) -> Hindrance | None:
-        """Return a reason if state variables change, because the response of particles is computed
-        from the initial values of the state variables."""
+        """Return the reason why leaders along an axis do not support a mode. Kernels do not support
+        them if parameters change in time, because the response of particles is computed once, from
+        initial values."""
         reasons = {
             Mode.GPU: "leaders lead along an axis",
             Mode.TIME_DEPENDENT: PUSHED_BY_TIME_DEPENDENCE,
@@ -558,8 +559,8 @@ class TurnDirections(DirectionOperation):
         step.directions = [(value, places, value[places]) for value in values]
 
     def emit(self, kernel: KernelWriter) -> None:
-        """Write nothing: directions are rotated before a call, and only the first step of a call
-        may rotate them."""
+        """Write no lines. A call of the kernel makes several steps, and only in the first of them
+        may directions rotate. They are rotated on the host before the call."""
 
     def prepare(self, call: Call) -> None:
         """Rotate the directions in the first step of a call."""

@@ -387,7 +387,7 @@ def _coordinates(
 
 
 def coordinate(path: str, values: tuple[Any, ...], experiment: Experiment) -> Coordinate:
-    """Return the values of a parameter with its path and, if it has one, its unit.
+    """Return the values of a parameter and, as attributes, its path and its unit (if it has one).
 
     If all values are texts with numbers of the same unit, they are converted to numbers.
     """

@@ -125,7 +125,8 @@ def pulls_at_rest(scene: Scene, state: State) -> bool:
 
 
 def rigid_motions(scene: Scene) -> Floats:
-    """Return the translations and the small rotation about the middle, (2 particles, 3).
+    """Return the two translations and the small rotation about the middle. Each is a column of the
+    result, with two rows for each particle.
 
     Their largest displacement is 1.
     """

@@ -170,8 +170,8 @@ def _choice(rows: list[Data]) -> str:
 
     sizes = sorted({r["size"] for r in rows if r["rule"] == "barycentre"})
     head = (
-        "size", "ratio of the times of a step", "steps, kernel in the cache",
-        "steps, kernel to be compiled",
+        "size", "ratio of the times of a step", "steps if the kernel is in the cache",
+        "steps if the kernel must be compiled",
     )  # fmt: skip
     return _table(head, map(cells, sizes))
 
@@ -200,9 +200,11 @@ def _ranks(found: Data) -> str:
     mib = [held / 2**20 for held in (found["alone_bytes"], *found["rank_bytes"])]
     rows = [
         ("one process, one thread", f"{ns['1']:.2f} ns per particle and step", ""),
-        ("one process, two threads", f"{ns['2']:.2f} ns", f"{ns['1'] / ns['2']:.2f} × one thread"),
+        ("one process, two threads", f"{ns['2']:.2f} ns",
+         f"{ns['1'] / ns['2']:.2f} × as fast as one thread"),
         ("two processes", f"{ns['shared']:.2f} ns",
-         f"{ns['1'] / ns['shared']:.2f} × one, {ns['2'] / ns['shared']:.2f} × two threads"),
+         f"{ns['1'] / ns['shared']:.2f} × as fast as one thread, "
+         f"{ns['2'] / ns['shared']:.2f} × as fast as two"),
         ("an exchange", f"{found['exchange'] * 1e3:.2f} ms",
          f"{found['sent_bytes'] / 1e6:.1f} MB each way, every {found['between']} steps"),
         ("4000² in one process", f"{mib[0]:.0f} MiB", ""),

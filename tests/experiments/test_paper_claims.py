@@ -67,8 +67,8 @@ def test_longest_bond_is_that_of_the_configuration_of_the_fracture_test():
             u[1:-1] = u[1:-1] / 2 + (u[:-2] + u[2:]) / 4
         longest[speed] = max(found)
     said = measured("about 10 units")
-    assert f"{longest[1.2]:.2f} if the leaders move by 1.2" in said
-    assert f"{longest[0.35]:.2f} if they move by 0.35" in said
+    assert f"the largest length then occurs in step 10 and is {longest[1.2]:.2f};" in said
+    assert f"if they move by 0.35 per step, the largest length is {longest[0.35]:.2f}." in said
     assert parted("d1", longest[1.2] - 1e-9) == [10] * 10
     assert parted("d1", longest[1.2] + 1e-9) == [None] * 10
 

@@ -265,7 +265,7 @@ def find_runs(scene: Scene, all_general: bool) -> tuple[Ints, Ints, tuple[tuple[
 
 
 def _joined(lines: Ints) -> Ints:
-    """Merge runs in consecutive rows that have the same columns."""
+    """Merge runs of particles that lie in consecutive rows and span the same columns."""
     *lead, row, begin, end = lines.T
     lines = lines[np.lexsort((row, end, begin, *reversed(lead)))]
     step = np.diff(lines, axis=0)

@@ -305,7 +305,7 @@ def _digests(folder: Path) -> dict[str, str]:
 def _prepared(
     source: str, names: dict[str, Any], arguments: tuple[Any, ...], folder: Path | None = None
 ) -> Any:
-    """Return the kernel after its first call. The call compiles the kernel or loads it from its
+    """Call the kernel once and return it. The call compiles the kernel or loads it from its
     folder."""
     file = str(folder / SOURCE) if folder else "<kernel>"
     module = ModuleType(folder.name if folder else "kernel")

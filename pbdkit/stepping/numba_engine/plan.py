@@ -153,7 +153,7 @@ class Plan:
 
     @cached_property
     def prescribed_numbers(self) -> tuple[int, ...]:
-        """State variables of particles that operations prescribe."""
+        """Those state variables of particles to which operations assign prescribed values."""
         return tuple(chain(*(operation.prescribed_numbers() for operation in self.program)))
 
     @cached_property
@@ -253,7 +253,7 @@ class Plan:
         return [pattern.replace("@", c).replace("#", str(a)) for a, c in named]
 
     def vector(self, pattern: str) -> str:
-        """Return a vector of components that follow the pattern."""
+        """Return a vector expression. Its components are given by the pattern for each axis."""
         return f"Vector({', '.join(self.each(pattern))})"
 
     def literal(self, values: Iterable[float]) -> str:
@@ -332,7 +332,7 @@ class PlanWriter(KernelWriter):
         return self.plan.each(pattern, axes)
 
     def vector(self, pattern: str) -> str:
-        """Return a vector of components that follow the pattern."""
+        """Return a vector expression. Its components are given by the pattern for each axis."""
         return self.plan.vector(pattern)
 
     def number(self, value: float) -> str:

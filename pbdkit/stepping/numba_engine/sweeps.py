@@ -383,8 +383,8 @@ def write_row_loop(out: Function, plan: Plan, level: Level, s: str) -> None:
 
 
 def write_rows(out: Function, plan: Plan, level: Level, s: str) -> None:
-    """Write lines that define the arrays of the values at particles j0 to j1 of a row, and of their
-    moves."""
+    """Write lines that define the arrays for particles j0 to j1 of a row. These arrays contain
+    their displacements and their moves."""
     n = level.number
     rows = {"h@": "u_@", "o@": "v_@" if level is plan.levels[-1] else f"z{n}_@"}
     if n:
