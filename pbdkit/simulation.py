@@ -714,7 +714,7 @@ class Simulation:
         return quick_warnings(self.scene, self.waves)
 
     def further_warnings(self) -> list[str]:
-        """Return those warnings of `check` that `warnings` lacks, if they take less than a
+        """Return the warnings of `check` that are not in `warnings` and can be computed within a
         second."""
         repeats = bool(self.waves) and "solver.relaxation" in " ".join(self.warnings)
         warnings = further_warnings(self.scene)

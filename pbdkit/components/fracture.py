@@ -237,8 +237,8 @@ SCATTER = "Scatter s: strengths are multiplied by random factors, uniform in 1 Â
 
 
 def _drawn(bonds: Bonds, scatter: float, generator: np.random.Generator, **strains: float) -> Drawn:
-    """Return each strain of every bond times a random factor of the bond; without scatter
-    nothing."""
+    """Return the values of the strains for every bond: each strain, multiplied by a random factor
+    of the bond. The result is empty if there is no scatter."""
     if not scatter:
         return {}
     factors = 1.0 + scatter * generator.uniform(-1.0, 1.0, len(bonds))

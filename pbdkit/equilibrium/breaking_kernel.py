@@ -119,7 +119,7 @@ def factor(band: Any, first: int, diagonal: Any, inverse: Any) -> None:
 
 
 def solve(band: Any, inverse: Any, x: Any) -> None:
-    """Replace right sides (unknown, side) by solutions."""
+    """Replace right-hand sides by solutions. The shape of x is (unknown, right-hand side)."""
     half, sides = band.shape[1] // 2, x.shape[1]
     for i in range(len(band)):
         for k in range(max(0, i - half), i):
@@ -240,7 +240,7 @@ def _is_plain(scene: Scene) -> bool:
 
 
 def _seconds(scene: Scene) -> float:
-    """Estimate the time by numpy in seconds."""
+    """Estimate the time that the computation takes with numpy, in seconds."""
     renews = isinstance(scene.experiment.fracture, RenewsBonds)
     equilibria = scene.experiment.solver.equilibrium.increments * (
         EQUILIBRIA_IF_SOFTENING if renews else EQUILIBRIA_IF_BREAKING

@@ -174,9 +174,9 @@ class ContactSystem(System):
         return math.inf
 
     def distance(self, moves: Floats, rounding: float) -> float:
-        """Return the bound on the distance: the size of the solution for the remaining moves, plus
-        the effect of rounding. Rounding affects the displacements of all followers, and also the
-        positions of the followers in contact."""
+        """Return the bound on the distance from equilibrium: the size of the solution with the
+        remaining moves as right-hand side, plus the effect of rounding. Rounding affects the
+        displacements of all followers, and also the positions of the followers in contact."""
         r, far = self._table(moves), [0.0]
         for n, (members, part) in enumerate(self._parts):
             far.append(part.farthest(r[members], rounding * self._share_of_places))

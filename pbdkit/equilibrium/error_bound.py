@@ -210,7 +210,8 @@ class EquilibriumPredictor:
         self._broken = 0
 
     def predict(self, state: State) -> PredictedEquilibrium:
-        """Predict the equilibrium from the end of a step; the state is not changed.
+        """Predict the equilibrium that the run reaches, given the state at the end of a step; the
+        state is not changed.
 
         The distance is infinite if no bound is known: for bodies under a load that nothing
         balances, and for floating parts under rules that are not linear.
@@ -315,8 +316,9 @@ class Pace:
     successive steps decay at a rate of at least -ln ρ. The rate decreases during the run. The
     distance is extrapolated from two checks: distance ≈ ρ / (1 - ρ) · ‖last step‖, where ρ is
     determined from the ratio of the sizes of two steps. The extrapolated distance is too small as
-    long as several modes remain, and exact for a single mode. Checks are therefore early rather
-    than late. The estimate determines when a bound is computed, and not the value of the bound.
+    long as several modes remain, and exact for a single mode. Checks are therefore made too early
+    rather than too late. The estimate determines when a bound is computed, and not the value of the
+    bound.
     """
 
     next_look: int

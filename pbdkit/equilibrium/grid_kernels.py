@@ -3,9 +3,9 @@ and relax.
 
 A grid has two arrays (row, place): `code` is the index of the stencil in `own`, -1 where no
 particle is free; `kind` is 0 outside, 1 at free particles, 2 at leaders. The next grid is the next
-coarser one. It has half the places along the axes `halved`: there its place n coincides with place
-2n - 1 of this grid. Along the other axes its place n coincides with place n. Fields are planes
-(axis, row, place), zero where no particle is free; the outermost ring is never free.
+coarser one. It has half the places along the axes `halved`: along these axes its place n coincides
+with place 2n - 1 of this grid. Along the other axes its place n coincides with place n. Fields are
+planes (axis, row, place), zero where no particle is free; the outermost ring is never free.
 
 A row consists of runs and lone places. A run contains the places from `begin` to `end`, which all
 have the stencil `same`; a lone place has the stencil `own[which]`. A stencil has 3 × 3 places, row

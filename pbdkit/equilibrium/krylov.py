@@ -174,7 +174,8 @@ class Stabilised(KrylovResult):
 
     @property
     def ahead(self) -> float:
-        """Larger of the last two jumps."""
+        """Largest displacement in the last two iterations. It is used as the estimate, because an
+        extrapolation requires monotonic jumps."""
         return max(self.jumps[-2:]) if len(self.jumps) > 1 else math.inf
 
 

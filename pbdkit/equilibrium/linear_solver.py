@@ -333,8 +333,8 @@ def dissected(matrix: Any, places: Floats) -> Indices | None:
 
 
 def _reach(matrix: Any, places: Floats) -> Floats:
-    """Return the range of the couplings along each axis, with a margin for rounding; it is
-    positive."""
+    """Return the range of the couplings along each axis. It contains a margin for rounding, so that
+    it is positive."""
     row, column = matrix.tocoo().coords
     distances = [float(np.abs(x[row] - x[column]).max(initial=0.0)) for x in places.T.copy()]
     return 1.001 * np.array(distances) + 1e-9 * np.ptp(places) + TINY

@@ -261,8 +261,9 @@ def equilibrium_state(scene: Scene) -> tuple[State, ErrorBound]:
 
 
 def _of_linear(scene: Scene, state: State, finder: Finder, stops: Sequence[int]) -> EquilibriumPath:
-    """Compute the equilibria of some steps and of the last one. The state itself is moved to the
-    equilibria before changes of roles or loads."""
+    """Compute the equilibria of the steps `stops` and of the last step. Before each change of roles
+    or loads, `state` is replaced in place by the equilibrium of that step; at other stops a copy is
+    used."""
     steps, converged, last = scene.experiment.steps, None, last_event(scene)
     for stop in [*stops, steps]:
         for change in changes(scene, stop):

@@ -532,8 +532,8 @@ class MatrixSystem(System):
             return float(np.linalg.norm(difference) / np.linalg.norm(pull))
 
     def distance(self, moves: Floats, rounding: float) -> float:
-        """Return the bound on the distance: the size of the solution for the remaining moves, plus
-        the effect of rounding."""
+        """Return the bound on the distance from equilibrium: the size of the solution with the
+        remaining moves as right-hand side, plus the effect of rounding."""
         table, bounds = self._table(moves), np.zeros(2)
         for block in self._blocks:
             r = table[:, block.axes].ravel()
@@ -556,8 +556,8 @@ class MatrixSystem(System):
         return f"{len(numbers)} particles (with number {numbers[0]})"
 
     def _following(self, first: int) -> DiagonalBlock:
-        """Return the block of the other axis. If both blocks are equal, it shares the solvers of
-        the first one."""
+        """Return the block of the other axis. It shares the solvers of the block of the axis
+        `first` if both blocks are equal."""
         other, leader_couplings = 1 - first, self._operator.couplings_leader
         coupled = self._both.couples(other, first)
         into = self._both.entries([other], [first]).matrix() if coupled else None

@@ -447,9 +447,9 @@ def without_held(code: NDArray[np.int32], stencils: Floats, held: Held) -> Float
 
 
 def coarser_held(kind: NDArray[np.int8], held: Held, halved: tuple[int, int], below: Any) -> Held:
-    """Return the constrained components of the next coarser grid, which has the kinds `below`. A
-    component is constrained there if it is constrained at the place of this grid that coincides
-    with its place."""
+    """Return the constrained components on the next coarser grid. `below` contains the kinds of the
+    places of the coarser grid. Each of these places coincides with a place of this grid, and the
+    same components are constrained at both."""
     coarse = np.zeros((2, *below.shape), bool)
     for axis, component in enumerate(held):
         kinds, out = np.where(component, LED, kind).astype(np.int8), np.zeros_like(below)

@@ -167,8 +167,8 @@ def _rows_of(table: xarray.Dataset, columns: Sequence[str]) -> Floats:
 class Distortion(Strict):
     """Apparent displacements in the plane that are not displacements of the body, for instance
     those due to a rotated camera, a lens, or bending out of the plane. They are polynomials of x
-    and y with fitted amplitudes, given by exponents. For example, `ux: [[2, 0]]` is a displacement
-    proportional to x², or a strain that increases linearly along x."""
+    and y. Each term is given by exponents; its amplitude is fitted. For example, `ux: [[2, 0]]` is
+    a displacement proportional to x², or a strain that increases linearly along x."""
 
     ux: Terms = ()
     uy: Terms = ()

@@ -163,7 +163,7 @@ class RestingScene:
         Raises
         ------
         ExperimentError
-            If a part of the body that is not constrained was displaced.
+            If some part of the body is not constrained and was displaced.
         """
         system = self._linearised()
         try:

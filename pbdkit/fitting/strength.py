@@ -956,7 +956,7 @@ class PeakDistribution:
 
     @classmethod
     def of(cls, logs: Floats, y: Floats) -> PeakDistribution:
-        """Fit the distribution by maximum likelihood with normal residuals.
+        """Fit the distribution by maximum likelihood. Residuals are assumed to be normal.
 
         Mean and variance are fitted alternately.
         """

@@ -126,15 +126,15 @@ class NewFile(io.RawIOBase):
         self._fault: OSError | None = None
 
     def readable(self) -> bool:
-        """Return True: the file supports it."""
+        """Return True, because the file can be read."""
         return True
 
     def writable(self) -> bool:
-        """Return True: the file supports it."""
+        """Return True, because the file can be written."""
         return True
 
     def seekable(self) -> bool:
-        """Return True: the file supports it."""
+        """Return True, because the file supports seeking."""
         return True
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:

@@ -48,8 +48,8 @@ header. At least one commit precedes the replacement."""
 
 
 def write_header(file: io.FileIO, header: Header) -> None:
-    """Write the header into the open records. It fits into one sector of the disk. Raises
-    OSError."""
+    """Write the header into the records, given as an open file. The header fits into one sector of
+    the disk. Raises OSError."""
     fields = LAYOUT.pack(MAGIC, *header)
     file.seek(0)
     write_all(file, fields + xxhash.xxh3_64_digest(fields))

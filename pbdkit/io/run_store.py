@@ -546,8 +546,9 @@ class UnfinishedRun:
 
     @classmethod
     def open(cls, output: Path, *, writing: bool, anyway: bool = False) -> UnfinishedRun:
-        """Open an existing store. With `anyway`, a store that has lost commits is opened, too. A
-        damaged store is not changed. Raises ExperimentError if another process writes the store."""
+        """Open an existing store. With `anyway`, a store is opened even if its last commits are
+        lost. A damaged store is not changed. Raises ExperimentError if another process writes the
+        store."""
         store, records = store_of(output), records_of(output)
         try:
             disk = open_locked(records) if writing else io.FileIO(records, "rb")

@@ -83,11 +83,11 @@ class SealedFile(io.RawIOBase):
         self._unchecked = np.ones(len(self.seal.table) if self.seal else 0, bool)
 
     def readable(self) -> bool:
-        """Return True: the file supports it."""
+        """Return True, because the file can be read."""
         return True
 
     def seekable(self) -> bool:
-        """Return True: the file supports it."""
+        """Return True, because the file supports seeking."""
         return True
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:

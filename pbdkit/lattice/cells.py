@@ -57,7 +57,7 @@ class Patch:
     polygon
         Shape of the cells.
     corners
-        Blocks of the k-th corners.
+        Block for each corner of the polygon. Block k contains the k-th corners of all cells.
     whole
         Mask of the cells with all corners in the body, (cell, cell).
     """

@@ -50,7 +50,8 @@ class OmittedCells:
 
     @classmethod
     def of(cls, sites: Indices) -> OmittedCells:
-        """Create from the sites of the first corners, (cell, axis)."""
+        """Count omitted cells, given the sites of their first corners in an array of shape (cell,
+        axis)."""
         return cls(len(sites), min(map(tuple, sites.tolist()), default=None))
 
     def __add__(self, other: OmittedCells) -> OmittedCells:
@@ -78,11 +79,12 @@ class Block:
         return Block(slot.target, start, stop)
 
     def of(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return the values of (..., sublattice, cell, cell) on the block, as a view."""
+        """Return a view of the values on the block, given an array of shape (..., sublattice, cell,
+        cell)."""
         return values[(..., *self.slices())]
 
     def within(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return the values of (..., cell, cell) on the block, as a view."""
+        """Return a view of the values on the block, given an array of shape (..., cell, cell)."""
         return values[(..., *self.slices()[1:])]
 
     def rows(self, cells: int) -> list[Block]:
@@ -106,13 +108,14 @@ class Places:
     place: Indices
 
     def of(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return the values of (..., sublattice, cell, cell) at the places."""
+        """Return the values at the places, given an array of shape (..., sublattice, cell,
+        cell)."""
         flat = values.reshape(*values.shape[: values.ndim - len(self.shape)], -1)
         result: NDArray[Any] = flat[..., self.place]
         return result
 
     def within(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return the values of (..., cell, cell) at the places."""
+        """Return the values at the places, given an array of shape (..., cell, cell)."""
         flat = values.reshape(*values.shape[: values.ndim - len(self.shape) + 1], -1)
         result: NDArray[Any] = flat[..., self.place % math.prod(self.shape[1:])]
         return result
@@ -208,8 +211,8 @@ class RowRange:
     own
         Range of the lines that belong to this process.
     framed
-        Range of the lines with those frame points that this process assigns to the body particles
-        they follow.
+        Range of lines of sites. For the frame points on these lines, this process determines the
+        body particles that they follow.
     """
 
     stretch: Stretch

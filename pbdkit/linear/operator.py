@@ -64,8 +64,9 @@ class Guiding:
         return np.where(self.guided.place[order[at]] == place, order[at], -1)
 
     def turned(self, place: Indices, values: Floats) -> Floats:
-        """Return the constrained moves, or blocks, of particles at flat places, (particle, axis,
-        ...), given the unconstrained ones."""
+        """Return the constrained moves of particles at flat places, given the unconstrained moves.
+        The shape is (particle, axis, ...), so that blocks of a matrix can be given in place of
+        moves."""
         numbers = self.numbers(place)
         if not (rows := np.flatnonzero(numbers >= 0)).size:
             return values

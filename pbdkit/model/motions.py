@@ -508,7 +508,7 @@ class Rotation(Motion):
         return np.stack([-versine * x - sine * y, sine * x - versine * y], axis=-1)
 
     def turned(self, n: float) -> float:
-        """Return angle · min(n, steps), radians."""
+        """Return angle · min(n, steps) in radians."""
         return math.radians(self.angle * min(n, self.steps))
 
     def knots(self) -> tuple[int, ...]:

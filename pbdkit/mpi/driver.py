@@ -241,8 +241,8 @@ class DistributedSteppingDriver(SteppingDriver):
         return self._division.state_dict(super().state_dict())
 
     def load_state_dict(self, parts: Mapping[str, Any]) -> None:
-        """Restore the driver from the dictionary with the state of the whole lattice, which only
-        the first process has."""
+        """Restore the driver. `parts` contains the state of the whole lattice in the first process,
+        and is not used in the others."""
         super().load_state_dict(self._division.scattered(parts))
 
 
@@ -367,8 +367,8 @@ class DistributedEquilibriumDriver(EquilibriumDriver):
         return self._division.state_dict(super().state_dict())
 
     def load_state_dict(self, parts: Mapping[str, Any]) -> None:
-        """Restore the driver from the dictionary with the state of the whole lattice, which only
-        the first process has."""
+        """Restore the driver. `parts` contains the state of the whole lattice in the first process,
+        and is not used in the others."""
         super().load_state_dict(self._division.scattered(parts))
 
     def _path(self, state: State) -> EquilibriumPath:

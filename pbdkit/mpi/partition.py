@@ -332,7 +332,7 @@ class Halo:
         return slice(first, max(first, last))
 
     def _members(self, *within: slice) -> list[Array]:
-        """Return the members of each leader group that lie in some rows."""
+        """Return, for each leader group, those members that lie in the given ranges of rows."""
         ins = [[(at >= rows.start) & (at < rows.stop) for rows in within] for at in self._at]
         return [np.flatnonzero(np.logical_and.reduce(masks)) for masks in ins]
 
@@ -478,7 +478,8 @@ class RowCount:
         return rows.astype(np.int64)
 
     def stretch(self, begin: int, end: int) -> Stretch:
-        """Return the stretch of the rows from `begin` to `end`, which is excluded."""
+        """Return the range of the lines of sites in the rows from `begin` to `end`; row `end` is
+        excluded."""
         first, last = self._line(begin), self._line(end)
         near, far = first - self.layers, last + self.layers
         return Stretch(

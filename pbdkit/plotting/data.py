@@ -669,10 +669,10 @@ THINNEST = 40.0
 
 @dataclass(frozen=True)
 class Extent:
-    """Extent of several steps. `box` is the bounding box (left, right, bottom, top). `of_body` are
-    the lowest and the highest value in the body, and `of_all` those in the body and the frame.
-    `kinds` are the kinds of particles that occur, and `classes` the classes of the quantity that
-    occur."""
+    """Extent of several steps. `box` is the bounding box (left, right, bottom, top). `of_body`
+    contains the lowest and the highest value in the body, and `of_all` contains those in the body
+    and the frame. `kinds` are the kinds of particles that occur, and `classes` the classes of the
+    quantity that occur."""
 
     box: Box
     of_body: tuple[float, float]

@@ -319,8 +319,8 @@ def draw_outline(ax: Axes, sides: Array) -> None:
 
 
 def draw_numbers(ax: Axes, numbers: Array, snapshot: Snapshot, size: float) -> None:
-    """Write the numbers of particles to the upper right of their dots, which have a size in points.
-    Numbers that would overlap are omitted."""
+    """Write the number of each particle to the upper right of its dot. `size` is the size of the
+    dots in points. Numbers that would overlap are omitted."""
     places, font = ax.transData.transform(snapshot.position), 6.0
     point = figure_of(ax).dpi / 72
     occupied: set[tuple[int, int]] = set()

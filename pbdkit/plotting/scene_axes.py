@@ -1,4 +1,4 @@
-"""The set-up of an experiment on axes of matplotlib."""
+"""Drawing of the set-up of an experiment on matplotlib axes."""
 
 from __future__ import annotations
 

@@ -58,8 +58,8 @@ class Quantity:
     length, youngs_modulus, thickness : int
         Exponents.
     also : Quantity, optional
-        Second quantity that is accepted, such as a length for a fracture energy, which is then
-        divided by Young's modulus.
+        Second quantity that is accepted. For example, a fracture energy can also be given as a
+        length, which is the energy divided by Young's modulus.
     """
 
     meaning: str

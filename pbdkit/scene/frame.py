@@ -156,7 +156,7 @@ class RasterFrame(FrameSites):
         """Return all pairs (point, body) of a frame point and a body particle that is nearest to
         it. If several body particles are equally near, there is a pair with each of them.
 
-        Searches outward from every frame point, shell by shell.
+        The search proceeds outward from every frame point, shell by shell.
         """
         sublattice = self.raster.cells_of(self.frame_rows)[0]
         groups = ((s, np.flatnonzero(sublattice == s)) for s in distinct(sublattice))

@@ -174,8 +174,8 @@ def sizes_of(
 
 
 def _workspace(experiment: Experiment, each: int, planes: float) -> float:
-    """Return the number of bytes per particle in addition to the state and the particle table, for
-    particles with `each` neighbours."""
+    """Return the number of bytes per particle in addition to the state and the particle table.
+    `each` is the number of neighbours of a particle."""
     rule, frame, diagnostics = experiment.rule, experiment.frame, experiment.diagnostics
     workspace = WORKSPACE + experiment.shows_bonds * planes * BONDS
     workspace += INNER * isinstance(rule, AppliesTwice) + LOADS * bool(experiment.loads)

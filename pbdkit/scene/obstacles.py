@@ -167,8 +167,8 @@ class Outline:
         return gap, nx, ny
 
     def outline_correction(self, at: Floats, C: Floats) -> Floats:
-        """Evaluate `outline_correction` at places, (axis, place), with the compliance C, (xx xy yy,
-        place)."""
+        """Call the function `outline_correction` with the data of this outline. `at` has the shape
+        (axis, place), and the compliance C has the shape (xx xy yy, place)."""
         whole = self.points, 0, len(self.points), self.inner, self.outer
         result = outline_correction(at[0], at[1], C[0], C[1], C[2], self.kind, *whole)
         return np.stack([np.broadcast_to(component, at[0].shape) for component in result])

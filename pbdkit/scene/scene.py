@@ -194,7 +194,7 @@ class Scene:
     neighbourhood
         Neighbours on the lattice.
     raster
-        Particles.
+        Raster of the particles.
     constants
         Constants of the rule and the fracture model.
     frame

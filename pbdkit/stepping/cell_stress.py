@@ -50,8 +50,8 @@ class CellBeside:
         ]
 
     def flat_offset(self, corner: tuple[int, Index], slot: Slot, shape: tuple[int, ...]) -> int:
-        """Return the difference of flat places between the start of a bond along a slot and a
-        corner."""
+        """Return the offset in flat arrays from the start of a bond along the slot to a corner of
+        the cell."""
         step = corner[0] - slot.source
         for size, cells in zip(shape[1:], corner[1], strict=True):
             step = step * size + cells
@@ -131,8 +131,8 @@ class CellStresses:
         return self._scene.neighbourhood.tiling
 
     def of(self, u: NDArray[Any], slot: Slot, owner: Block) -> tuple[CellStress, CellStress]:
-        """Return the cells to the left and right of the bonds along a slot that start in a
-        block."""
+        """Return the cells to the left and to the right of bonds. The bonds lie along the slot and
+        start in the block `owner`."""
         precision = self._scene.experiment.stepping.precision
         shares = self._cells.beside(slot, owner, precision, self._cells.share)
         ratios = [self.ratios] * 2

@@ -230,9 +230,9 @@ class Contact:
                     yield tuple(n + a for n, a in zip(np.nonzero(inside), near.start, strict=True))
 
     def touching(self, state: State, moment: float) -> Touching:
-        """Return for each obstacle the followers on its outline at a moment, as rows of the table
-        of particles, and the normals at these particles, (row, axis). Guided particles are
-        included.
+        """Return the followers on the outlines of obstacles at a moment. For each obstacle they are
+        given by their rows in the particle table and by the normals at their positions, of shape
+        (row, axis). Guided particles are included.
 
         A particle counts as lying on the outline if its distance is at most the rounding error plus
         1e-9 of a lattice constant. The row of a particle at a corner of two faces occurs twice.

@@ -394,7 +394,7 @@ def first_launch(run: Any, arguments: tuple[Any, ...]) -> None:
 
 
 def launcher(run: Any, blocks: int, threads: int) -> Any:
-    """Return a function that launches a kernel, without warnings about few blocks."""
+    """Return a function that launches a kernel. The warning about too few blocks is suppressed."""
     with catch_warnings():
         simplefilter("ignore", NumbaPerformanceWarning)
         return run[blocks, threads]

@@ -220,7 +220,8 @@ def _summed(part: Any, owner: Indices, count: int) -> Any:
 
 
 class MoveFollowers(Operation):
-    """Move the particles of the body by the rule, including leaders and guided particles."""
+    """Move all particles of the body by the rule. Leaders and guided particles are moved too; other
+    operations then correct their displacements."""
 
     makes_moves = True
 

@@ -90,8 +90,8 @@ class FollowFrame(Operation):
         return np.stack([index[1], index[-1]])
 
     def hindrance(self, mode: Mode) -> Hindrance | None:
-        """Return a reason if the map changes with time, because it is then stored on the host and
-        for the whole lattice."""
+        """Return the reason why a frame with weights that change in time does not support a mode.
+        The weights are then stored on the host and for the whole lattice."""
         reasons = {
             Mode.TIME_DEPENDENT: "the weights of the frame are time-dependent",
             Mode.RANKS: "a frame that depends on time-dependent parameters of the rule",

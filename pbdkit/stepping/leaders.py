@@ -370,8 +370,8 @@ class LeaderOperation(Operation):
 
     @property
     def endings(self) -> dict[str, str]:
-        """Endings of the names of lists, with the axes along which the particles of the list are
-        led."""
+        """Endings of the names of the lists of leaders. To each ending belong the axes along which
+        the particles of the list are led."""
         axes = "xyz"[: self.scene.axes]
         return {f"_{c}": c for c in axes} if has_guides(self.scene.leading) else {"": axes}
 

@@ -61,7 +61,7 @@ def program_of(
 
 
 def prepare(program: Program, state: State) -> Call:
-    """Return the data for a call of a kernel, prepared for the step that follows a state."""
+    """Return the data with which a kernel is called to make the step after a state."""
     call = Call(state)
     for operation in program:
         operation.prepare(call)

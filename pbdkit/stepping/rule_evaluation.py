@@ -381,8 +381,8 @@ class Surroundings:
         return torn
 
     def _damage(self, bond: CellBond, state: State) -> tuple[NDArray[np.floating[Any]], ...]:
-        """Return the fractions of the force of bonds that are lost in the cells to their left and
-        right; 1 for broken bonds."""
+        """Return the lost fractions of the forces of bonds, one array for the cells to the left of
+        the bonds and one for the cells to their right. The fractions are 1 for broken bonds."""
         scene, owner = self._scene, self.where
         if bond.owner:
             owner = owner.seen_through(bond.owner)

@@ -86,7 +86,7 @@ class Reach(NamedTuple):
     Parameters
     ----------
     reach
-        Distance of neighbours.
+        Largest distance to a neighbour.
     back, ahead
         Distances behind and ahead of a particle. Up to these distances bonds are updated, or moves
         of an inner rule are computed, before the particle moves.
@@ -106,7 +106,8 @@ class Reach(NamedTuple):
 
     @property
     def step(self) -> int:
-        """Distance by which each step of a pass follows the previous step."""
+        """Distance by which the region of each step in a pass is shifted against the region of the
+        previous step."""
         sees = max(self.reach, self.above + self.ahead, self.below + self.back)
         return max(sees + self.apart, self.back + self.ahead)
 
@@ -306,8 +307,8 @@ class Operation(ABC):
         return
 
     def disturbances(self, call: Call) -> Iterator[Cells]:
-        """Generate the cells of the particles at rest that the operation itself moves in a call.
-        Their neighbours, which move in later steps, are not included."""
+        """Generate the cells of particles that rest before a call and are moved by the operation
+        itself in the call. Their neighbours, which move in later steps, are not included."""
         yield from ()
 
     def fixed_places(self) -> Indices:

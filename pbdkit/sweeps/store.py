@@ -364,7 +364,8 @@ class Store:
     def _intact_rows(self) -> Iterator[Row]:
         """Yield the intact rows of a damaged database.
 
-        It is read from its beginning and from its end, each up to the damage.
+        The database is read twice, from its beginning up to the damage and from its end back to the
+        damage.
         """
         for order in ("", "ORDER BY rowid DESC"):
             with suppress(sqlite3.Error), ExitStack() as stack:

@@ -361,8 +361,9 @@ def remembered(subject: Subject, scene: Scene) -> tuple[Remembered, ...]:
 
 @property_of(FollowerRule, FractureModel, is_needed=True)
 def draws_what_it_remembers(subject: Subject) -> None:
-    """`draw` returns for the name of a state variable one finite value for each bond or particle,
-    which the dtype of the variable can hold; it takes random numbers from the given generator only.
+    """For the name of a state variable `draw` returns one finite value for each bond or particle.
+    The dtype of the variable can hold these values. `draw` takes random numbers from the given
+    generator only.
     """
     part = subject.component
     for scene in subject.scenes:
@@ -804,8 +805,9 @@ def rests_as_declared(subject: Subject) -> None:
 
 @property_of(FramePolicy)
 def takes_every_point_alone(subject: Subject) -> None:
-    """The particles that a frame point follows do not depend on the other frame points, because
-    ranks and tests compute frame points separately."""
+    """A frame point follows the same particles if `follow` is called with all frame points and if
+    it is called with some of them. Ranks and tests require this, because they compute frame points
+    separately."""
     policy, reason = subject.component, "it has no points"
     for scene in subject.scenes:
         frame = sites_of_frame(scene.raster, scene.experiment.rule)

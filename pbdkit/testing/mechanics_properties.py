@@ -243,7 +243,8 @@ def gives_no_energy_back(subject: Subject) -> None:
 def _check_stiffness(
     subject: Subject, measure: Callable[[Scene, Floats], float], fault: str, remedy: str
 ) -> None:
-    """Raise PropertyError if a measure of the stiffness of a solid exceeds its rounding."""
+    """Raise PropertyError if the measure, evaluated for the stiffness matrix of a solid, exceeds
+    the rounding error of the matrix."""
     for solid in _solids(subject):
         for body, K in solid.stages:
             if (measured := measure(solid.scene, K)) > _rounding(solid.scene):

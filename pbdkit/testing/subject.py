@@ -437,7 +437,7 @@ class Subject:
 
     @cached_property
     def solids(self) -> list[Solid]:
-        """Small solids with the component.
+        """Small solids in which the component is used.
 
         Raises
         ------

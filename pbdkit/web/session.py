@@ -149,8 +149,8 @@ class LiveStepper:
         self._until = -1
 
     def set(self, state: State) -> State:
-        """Build the scene of the step after a state, and return the state adapted to it. Raises
-        ExperimentError if that is impossible."""
+        """Build the scene for the step that follows a state. Return the state, adapted to this
+        scene. Raises ExperimentError if that is impossible."""
         if not self._since <= state.step < self._until:
             experiment = self.script.experiment.of_parts(self.script.playing(state.step))
             if experiment.parts_bonds != self.scene.has_fracture:
@@ -368,7 +368,8 @@ class GrabbedParticle:
 
 @dataclass
 class Session:
-    """Experiment of which steps are made without end. Commands are executed between two steps.
+    """Experiment that is continued step by step, without a last step. Commands are executed between
+    two steps.
 
     All changes are recorded in the script. If the user goes back and makes a change, later changes
     are removed. Messages other than pictures are passed to `notify`. Raises ExperimentError if the

@@ -24,9 +24,10 @@ from pbdkit.stepping.program import Program
 
 
 class TileWriter(PlanWriter):
-    """Writer of step s of a pass in a tile of a piece, in the rows from i0 to i1 and the columns
-    from j0 to j1. Leaders are placed in all rows and columns that the step reads. Bonds and inner
-    rules are evaluated for rows and columns ahead of those in which particles move."""
+    """Writer of the kernel part that makes one step of a pass in one tile. The number of the step
+    in the pass is s; its region consists of the rows from i0 to i1 and the columns from j0 to j1.
+    Leaders are placed in all rows and columns that the step reads. Bonds and inner rules are
+    evaluated for rows and columns ahead of those in which particles move."""
 
     keeps_before = False
     _is_ahead = True

@@ -1,5 +1,5 @@
 """Plan of the kernel of a scene. It describes the levels of nested rules, the contents of the
-kernel, the expressions in its lines, and the sizes of passes of several steps."""
+kernel, the expressions in its lines, and the number of steps and the sizes of tiles in a pass."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ class Plan:
 
     @cached_property
     def prescribed_numbers(self) -> tuple[int, ...]:
-        """Those state variables of particles to which operations assign prescribed values."""
+        """State variables of particles that are set to prescribed values by operations."""
         return tuple(chain(*(operation.prescribed_numbers() for operation in self.program)))
 
     @cached_property

@@ -165,8 +165,8 @@ class RowDamage:
             loops.append(f"    damage[{m}, j] = {damage_word(plan, *words, side)}")
 
     def beside(self, slot: Slot) -> str:
-        """Return a line that computes t, the damage of the bond along a slot of particle j of the
-        row and of the cells beside this bond."""
+        """Return a line that computes t for the bond along a slot of particle j. The variable t
+        contains the damage of the cells on both sides of this bond and of the bond itself."""
         plane, at_this_end = self._owner[slot]
         ends = (0, 1) if at_this_end else (1, 0)
         owner = None if at_this_end else slot
@@ -216,11 +216,11 @@ def stress_lines(plan: Plan, owner: str) -> list[str]:
 
 
 def stress_arrays(scene: Scene, real: np.dtype[Any]) -> dict[str, NDArray[Any]]:
-    """Return the tables that the lines of `stress_lines` read. They have entries for each plane of
-    bonds and each side of a bond. Index offsets in flat arrays begin at the end at which a bond is
-    stored: `corner_steps` are those to the corners of the cell, and `body_steps` that to the area
-    fraction of the cell. `corner_rates` contains the weights of the corners in the displacement
-    gradient."""
+    """Return the tables that the lines of `stress_lines` read. They have an entry for the left and
+    the right side of the bonds along each slot. A bond is stored at one of its ends. `corner_steps`
+    are index offsets in flat arrays from this end to the corners of the cell, and `body_steps` is
+    the offset to the place of the area fraction of the cell. `corner_rates` contains the weights of
+    the corners in the displacement gradient."""
     assert scene.cells is not None
     stresses, shape = CellStresses(scene), scene.raster.shape
     steps, rates, shares = [], [], []
