@@ -399,7 +399,7 @@ def sweep(
         Folder to which finished members are written. A second call with the same folder runs only
         the members that are missing.
     workers : int, optional
-        Number of processes; by default one for each processor. With 1 no process is started.
+        Number of processes; by default one for each processor. With 1, no process is started.
     client : dask.distributed.Client, optional
         Cluster that runs the members instead of local processes.
     progress : bool

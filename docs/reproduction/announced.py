@@ -154,7 +154,7 @@ axis. The last column is √(D_x/D_y), the ratio of the widths of the distributi
 
 ![The displacement {STEPS} steps after a particle was displaced](../pictures/reproduction/{picture})
 
-The case `weighted` has weighted Euclidean neighbours on the square lattice. With w_y = 1/4 the
+The case `weighted` has weighted Euclidean neighbours on the square lattice. With w_y = 1/4, the
 neighbours two rows above and below are at the same distance as those one column away:
 
 ```yaml
@@ -166,7 +166,7 @@ The case `rectangular` has all eight neighbours on a rectangular lattice:
 {point_text("rectangular")}```
 
 Only the diffusivity is anisotropic: the body relaxes faster along the axis in which the
-neighbourhood reaches farther. With weighted neighbours the largest displacement along y that a
+neighbourhood reaches farther. With weighted neighbours, the largest displacement along y that a
 displacement along x causes is {signs["cross"]:.1g}. If the middle particle is displaced along y
 instead, u_y spreads exactly as u_x does in the first case (difference at most
 {signs["turned"]:.0e}). In an elastic body the two cases would differ: along the

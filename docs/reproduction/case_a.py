@@ -89,7 +89,7 @@ def _fields() -> list[Claim]:
             "those close to the frame follow with a little delay owing to the rule of the frame",
             "Within a step the leaders move before the frame. With four neighbours this order has "
             "no effect, and the displacements of the middle and the edge differ by "
-            f"{a.spread():.1g}. At step 9 they differ by {middle_8 - edge_8:.3f} with eight "
+            f"{a.spread():.1g}. At step 9, they differ by {middle_8 - edge_8:.3f} with eight "
             f"neighbours and by {middle - edge:.3f} with a frame delayed by one step.",
             a.spread() > 1e-6,
             "`paper/a-chebyshev` or `paper/a-lag`",
@@ -97,7 +97,7 @@ def _fields() -> list[Claim]:
         ),
         Claim(
             "avoid this convexity using a different frame or mirroring the followers",
-            "With a mirror frame the displacements of the rows differ by "
+            "With a mirror frame, the displacements of the rows differ by "
             f"{mirrored.spread():.1g} for four neighbours "
             f"({a.spread():.1g} with the mean frame) and by {mirrored_eight.spread():.3f} for "
             f"eight neighbours ({eight.spread():.3f} with the mean frame).",
@@ -130,7 +130,7 @@ def _energy() -> list[Claim]:
     return [
         Claim(
             "the maximum value of PE1 is not on the leader line but just on its left",
-            f"At step 9 PE1 is {at_9[8]:.2f} in the column left of the leaders, {at_9[9]:.2f} at "
+            f"At step 9, PE1 is {at_9[8]:.2f} in the column left of the leaders, {at_9[9]:.2f} at "
             f"the leaders, and {at_9[7]:.2f} one column farther left.",
             int(at_9.argmax()) == 8,
         ),

@@ -89,7 +89,7 @@ def _claims_b() -> list[Claim]:
         ),
         Claim(
             "PE1 … here is more evident the edge effect leading to concavity toward left",
-            "In the column left of the leaders PE1 is larger at the edge than in the middle rows, "
+            "In the column left of the leaders, PE1 is larger at the edge than in the middle rows, "
             f"by {near[9]:.2%}, {near[19]:.2%} and {near[99]:.1%} at times 10, 20 and 100 "
             f"({in_a:.2%} in case a at time 10). Its contours are therefore concave toward the "
             "left, which is visible at time 100. In the middle of the sheet the difference at this "
@@ -172,7 +172,7 @@ def _claims_c() -> list[Claim]:
         ),
         Claim(
             "the PE1 plot enhances the convexity of the first line of follower",
-            "At step 9 PE1 in the column left of the leaders is larger at the edge than in the "
+            "At step 9, PE1 in the column left of the leaders is larger at the edge than in the "
             f"middle, by {bow[0]:.2%} in b and by {bow[1]:.2%} in c.",
             bool(bow[1] > 2 * bow[0] > 0),
         ),

@@ -165,7 +165,7 @@ def _rebound() -> list[Claim]:
     return [
         Claim(
             "x of 103: after the fracture a sort of rebound [second gradient]",
-            "In `paper/d2` x decreases monotonically after its maximum at step "
+            "In `paper/d2`, x decreases monotonically after its maximum at step "
             f"{int(x_of(two).argmax())}. In `paper/d2-frame-bonds` it decreases to {back[1]:.3f} "
             f"at step {back[0]} and then increases permanently to {back[2]:.3f}. In "
             f"`paper/d2-chebyshev`, where the particle has the number {wide.number(COLUMN, ROW)}, "
@@ -178,7 +178,7 @@ def _rebound() -> list[Claim]:
         ),
         Claim(
             "differently from first gradient mode",
-            "With one shell the number of thresholds with a rebound is "
+            "With one shell, the number of thresholds with a rebound is "
             f"{kinds(swept('one shell'))}, but `paper/d2` has no rebound either. "
             "If bonds to the frame do not break, there is "
             f"{'one' if tied_one else 'no'} rebound with one shell, and one with two shells.",
@@ -213,7 +213,7 @@ def _energy() -> list[Claim]:
     return [
         Claim(
             "in the fracture case the pseudo energy plot is less indicative",
-            f"At step 99 PE1 in the column left of the gap is {all_bonds[8]:.1f} if the "
+            f"At step 99, PE1 in the column left of the gap is {all_bonds[8]:.1f} if the "
             f"broken bond is included and {intact[8]:.4f} if it is not.",
             bool(all_bonds[8] > 10 * intact[8]),
         ),

@@ -126,7 +126,7 @@ def _one_shell() -> list[Claim]:
         ),
         Claim(
             "j=133 [a central point]",
-            f"With two layers of frame particle 133 is in column {COLUMN + 1}, row {ROW + 1} of "
+            f"With two layers of frame, particle 133 is in column {COLUMN + 1}, row {ROW + 1} of "
             "the body. With one layer, which suffices for one shell, this particle has the "
             f"number {layer.number(COLUMN, ROW)}.",
             layer.number(COLUMN, ROW) == 133,
@@ -159,7 +159,7 @@ def _two_shells() -> list[Claim]:
         ),
         Claim(
             "no rebound [of 133]",
-            "In `paper/f2` x decreases monotonically after the fracture. There is a rebound at a "
+            "In `paper/f2`, x decreases monotonically after the fracture. There is a rebound at a "
             f"threshold of {which(turning)}. The thresholds {which(list(family))} were tried.",
             rebound(x_of(f2)) is None,
         ),

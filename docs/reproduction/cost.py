@@ -20,7 +20,7 @@ def cost() -> list[Claim]:
             "computational costs are low because we do not solve differential equations",
             "A step is one sum over the neighbours, but many steps are needed. A held sheet of "
             f"{', '.join(f'{n} × {n}' for n in sizes)} particles is within 1 % of its equilibrium "
-            f"after {', '.join(map(str, steps))} steps. For twice the size the number of steps is "
+            f"after {', '.join(map(str, steps))} steps. For twice the size, the number of steps is "
             f"{growth:.1f} times as large. A sparse direct solver computes the equilibrium by "
             "solving the same equations once.",
             growth < 1.5,

@@ -135,7 +135,7 @@ def _rules() -> list[Claim]:
         ),
         Claim(
             "anisotropies [by weighted distance]",
-            f"With weighted Euclidean neighbours a disturbance spreads {1 / ratio:.2f} times as "
+            f"With weighted Euclidean neighbours, a disturbance spreads {1 / ratio:.2f} times as "
             "much along y as along x ([details](anisotropy-and-plasticity.md)).",
             ratio < 0.5,
         ),
@@ -190,7 +190,7 @@ def _shape() -> list[Claim]:
         ),
         Claim(
             "changing lattice we can obtain different results, all other conditions being equal",
-            f"In case a PE1 of the same particle is largest at step {peaks[0]} on the square "
+            f"In case a, PE1 of the same particle is largest at step {peaks[0]} on the square "
             f"lattice and at step {peaks[1]} on the hexagonal lattice.",
             peaks[0] != peaks[1],
         ),
@@ -212,7 +212,7 @@ def _shape() -> list[Claim]:
         ),
         Claim(
             "[fictitious elements] recover the original shape of the lattice … elastic behaviour",
-            "With λ = 1 the largest displacement at step 400 is "
+            "With λ = 1, the largest displacement at step 400 is "
             f"{run('paper/d1').residual():.3f} in `paper/d1` and "
             f"{run('paper/d2').residual():.3f} in `paper/d2`.",
             max(run("paper/d1").residual(), run("paper/d2").residual()) < 0.1,

@@ -54,7 +54,7 @@ def _settings() -> list[str]:
         "**A change of the threshold by 0.1 changes the torn sheet for hundreds of steps.** "
         "Figure 21 is reproduced with thresholds of 5.1 (`paper/f2-cusp`): a second fracture at "
         f"step {cusp}, no rebound, and a final displacement of "
-        f"{run('paper/f2-cusp').residual():.3f}. With one shell there is a rebound at 5.1 too "
+        f"{run('paper/f2-cusp').residual():.3f}. With one shell, there is a rebound at 5.1 too "
         f"({turn[1]:.2f} to {turn[2]:.2f}). At 5.2 the final displacement of the sheet with two "
         f"shells is {torn[1]:.2f}.",
         f"**The rebound of figure 16** is permanent ({low[1]:.2f} to {low[2]:.2f}) only if "
@@ -84,7 +84,7 @@ def _meaning() -> list[str]:
     return [
         "**A second shell is not a second gradient.** For waves along x, eight neighbours have "
         "the same effect as four with 1.5 times the relaxation: the relative stiffness at k = 1 is "
-        f"{eight:.4f} with eight and {four:.4f} with four. With 24 neighbours short waves are "
+        f"{eight:.4f} with eight and {four:.4f} with four. With 24 neighbours, short waves are "
         f"softer ({soft:.3f}). In gradient elasticity with a positive l² in its energy, short "
         "waves are stiffer than long ones; in the expansion of a lattice l² can be negative.",
         "**The model is diffusion.** Each coordinate diffuses independently. A particle k layers "

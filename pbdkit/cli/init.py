@@ -34,7 +34,7 @@ def experiments(name: str | None) -> None:
 def init(file: Path | None, origin: str | None) -> None:
     """Write an experiment to start from: a commented one, or a copy of a shipped one.
 
-    FILE is experiment.yaml by default. With --from it is the last part of NAME, followed by .yaml.
+    FILE is experiment.yaml by default. With --from, it is the last part of NAME, followed by .yaml.
     """
     path, text = (
         file or Path(Path(origin or "experiment").name + SUFFIX),

@@ -360,7 +360,7 @@ def experiments(**options: Any) -> None:
 def init(**options: Any) -> None:
     """Write an experiment to start from: a commented one, or a copy of a shipped one.
 
-    FILE is experiment.yaml by default. With --from it is the last part of NAME, followed by .yaml.
+    FILE is experiment.yaml by default. With --from, it is the last part of NAME, followed by .yaml.
     """
     call("init:init", **options)
 

@@ -122,9 +122,9 @@ def _fits(form: Schema, data: Mapping[str, Any]) -> bool:
 
 @completer
 def settings(context: click.Context, prefix: str) -> Iterator[str]:
-    """Complete a setting. Before `=` the candidates are the paths that can be set in the experiment
-    in the command line, after its other settings are applied. After `=` they are the words that the
-    schema permits, and the present value."""
+    """Complete a setting. Before `=`, the candidates are the paths that can be set in the
+    experiment in the command line, after its other settings are applied. After `=`, they are the
+    words that the schema permits, and the present value."""
     path, equals, _ = prefix.partition("=")
     # Plugins are only loaded if their types have to be listed.
     schema = experiment_schema(Registry(), installed=bool(equals))

@@ -18,7 +18,7 @@ UNLIMITED = 10_000
 
 
 def add_rows(table: Table, rows: Iterable[Sequence[str]]) -> None:
-    """Add rows of plain text. In them ``[x]`` is not interpreted as markup."""
+    """Add rows of plain text. In them, ``[x]`` is not interpreted as markup."""
     for row in rows:
         table.add_row(*map(Text, row))
 

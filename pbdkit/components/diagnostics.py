@@ -409,7 +409,7 @@ class StrainEnergy(Diagnostic):
 
     For a linear calibrated rule with the stiffness K it is ½ uᵀK u, for a nonlinear rule
     ('springs') the energy of the bonds. With a frame that has points it is -½ Σ u·f with the forces
-    f. In linear elasticity this is the work of the leaders.
+    f. In linear elasticity, this is the work of the leaders.
     """
 
     type: Literal["strain-energy"] = "strain-energy"

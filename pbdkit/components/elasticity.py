@@ -428,8 +428,8 @@ class IsotropicElastic(CellElastic):
         """Return a modulus divided by Young's modulus, and the ratios 1, 1, ν', (1 - ν')/2.
 
         The ratios are xx, yy, xy and shear of the stiffness, divided by the modulus. In plane
-        stress ν' = ν and the modulus is 1/(1 - ν²). In plane strain ν' = ν/(1 - ν) and the modulus
-        is 1/((1 - ν²)(1 - ν'²)).
+        stress, ν' = ν and the modulus is 1/(1 - ν²). In plane strain, ν' = ν/(1 - ν) and the
+        modulus is 1/((1 - ν²)(1 - ν'²)).
         """
         nu, in_plane, out_of_plane = self.poisson_ratio, self.poisson_ratio, 1.0
         if self.plane == "strain":
@@ -448,8 +448,8 @@ class Elastic(IsotropicElastic):
     """Isotropic linear elasticity, in plane stress or plane strain.
 
     The rule requires the square or rectangular lattice with 8 neighbours, or the hexagonal lattice
-    with 6 neighbours. On the hexagonal lattice the cells are linear triangles. For ν = -1 it is the
-    barycentre rule, on the square lattice with the four nearest neighbours and on the hexagonal
+    with 6 neighbours. On the hexagonal lattice the cells are linear triangles. For ν = -1, it is
+    the barycentre rule, on the square lattice with the four nearest neighbours and on the hexagonal
     lattice with all six. The rule is stable for a relaxation below (5 - 3ν)/4 (square, ν ≥ 0) or
     3(3 - ν)/8 (hexagonal, ν ≥ -1/3).
     """

@@ -274,7 +274,7 @@ class StrainFracture(Draws, BreaksAtStrain, Parting):
     def constants(self, slot: Slot) -> dict[str, float]:
         """Return `square` and, if there is no scatter, `failure_strain`.
 
-        With scatter `square` is |r|². Without scatter it is (1 + failure)² |r|², and
+        With scatter, `square` is |r|². Without scatter, it is (1 + failure)² |r|², and
         `failure_strain` is 0. The product is then computed once and not in every step, which avoids
         one rounding error.
         """
@@ -310,7 +310,7 @@ class StrainFracture(Draws, BreaksAtStrain, Parting):
 class Damage(Draws, Softens, RenewsBonds, BreaksAtStrain, Parting):
     """A bond softens above the strain `onset` and breaks at the strain `failure`.
 
-    With the strain ε of a bond its damage is the maximum over time of D = failure / (failure -
+    With the strain ε of a bond, its damage is the maximum over time of D = failure / (failure -
     onset) (1 - onset / ε). This is 0 at the onset and 1 at failure. Damage is irreversible and does
     not increase under compression. In place of d the rule receives the difference (1 - D) d + D
     lost, where `lost` is the displacement of the fictitious point minus that of the particle. With
@@ -586,7 +586,7 @@ def _material(rule: Calibrated) -> tuple[float, tuple[float, float, float, float
     """Return the release factor of a material, and its anisotropy ratios.
 
     The release factor is the stiffness along x divided by the squared modulus along x. With the
-    compliance S and the stiffness C in the plane the ratios are S_yy / S_xx, (2 S_xy + S_shear) /
+    compliance S and the stiffness C in the plane, the ratios are S_yy / S_xx, (2 S_xy + S_shear) /
     S_xx, C_yy / C_xx and (2 C_xy + 4 C_shear) / C_xx.
     """
     material = rule.elasticity()

@@ -102,9 +102,9 @@ class Chebyshev(LatticeNeighbours):
 class Euclidean(NeighbourMetric):
     """Neighbours within a weighted distance: √(w_x Δx² + w_y Δy²) ≤ radius (1 + 1e-9).
 
-    A shell consists of all offsets at one distance. With unequal weights the neighbourhood and thus
-    the body are anisotropic. With `reevaluate` the neighbours are determined again in every step,
-    in the intermediate configuration. More than `MAX_NEIGHBOURS` neighbours are an error.
+    A shell consists of all offsets at one distance. With unequal weights, the neighbourhood and
+    thus the body are anisotropic. With `reevaluate`, the neighbours are determined again in every
+    step, in the intermediate configuration. More than `MAX_NEIGHBOURS` neighbours are an error.
     """
 
     type: Literal["euclidean"] = "euclidean"

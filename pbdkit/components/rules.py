@@ -76,7 +76,7 @@ class DistanceWeighted(FollowerRule):
 
     The target is x_j = Σ |x_k - x_j| x_k / Σ |x_k - x_j|. A particle for which the sum of distances
     is 0 does not move. As printed in the paper, the rule is linearly unstable on every lattice:
-    after about 50 steps rounding errors dominate. With a relaxation below 1 it is stable (0.66 on
+    after about 50 steps rounding errors dominate. With a relaxation below 1, it is stable (0.66 on
     the square lattice).
     """
 
@@ -151,9 +151,9 @@ class Springs(TearsCells, Loadable, StoresEnergy, FollowerRule):
     At the position x_k + l₀ (x_j - x_k)/|x_j - x_k| of a follower the spring to neighbour k, of
     rest length l₀, has no force. The follower moves to the weighted mean of these positions over
     its neighbours. The weights are equal on the hexagonal lattice with 6 neighbours. On the square
-    lattice with 8 neighbours edges have twice the weight of diagonals. Weights of bonds on free
-    edges are half as large. For small strain the network is linear elastic in plane stress with ν =
-    1/3. Rotations are exact, and the energy of the springs does not increase with relaxation 1.
+    lattice with 8 neighbours, edges have twice the weight of diagonals. Weights of bonds on free
+    edges are half as large. For small strain, the network is linear elastic in plane stress with ν
+    = 1/3. Rotations are exact, and the energy of the springs does not increase with relaxation 1.
     """
 
     type: Literal["springs"] = "springs"

@@ -394,7 +394,7 @@ def _steps_until(value: float, wanted: float, rate: float) -> float:
 class SteadyStateMonitor:
     """Detection of the steady state of a run.
 
-    In a steady state roles are constant, leaders rest, the distance of all followers from
+    In a steady state, roles are constant, leaders rest, the distance of all followers from
     equilibrium is within the tolerance, and no bond can break before equilibrium is reached. With
     momentum or a frame delay, a step also depends on the previous state, and a body near its
     equilibrium may still vibrate about it. The displacement that they may still cause is therefore
@@ -465,7 +465,7 @@ class SteadyStateMonitor:
 
 def _remaining_motion(scene: Scene) -> float:
     """Return a bound on the displacement after the last step, divided by the displacement in that
-    step. For the momentum b it is |b| / (1 - |b|), because each further displacement is b times the
-    previous one. The frame delay is added."""
+    step. For the momentum b, it is |b| / (1 - |b|), because each further displacement is b times
+    the previous one. The frame delay is added."""
     memory = abs(scene.experiment.stepping.memory)
     return (memory / (1.0 - memory) if memory < 1.0 else np.inf) + scene.frame_delay

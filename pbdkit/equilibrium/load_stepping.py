@@ -208,7 +208,7 @@ def increments(
     bond breaks.
 
     Raises ExperimentError if there is no equilibrium, UnconvergedError, SeparatedError, and
-    StoppedError on interruption. After an exception `state` is the last state reached.
+    StoppedError on interruption. After an exception, `state` is the last state reached.
     """
     settings, steps = scene.experiment.solver.equilibrium, scene.experiment.steps
     for n, driven in enumerate(scene.driven):

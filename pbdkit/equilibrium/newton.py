@@ -46,7 +46,7 @@ MAX_CORRECTIONS = 12
 MAX_PROPOSED_TOLERANCE = 0.1
 """Largest tolerance that messages propose."""
 CONTRACTION = 0.5
-"""Largest accepted ratio of a correction to the previous one. With smaller ratios Newton's
+"""Largest accepted ratio of a correction to the previous one. With smaller ratios, Newton's
 iteration converges, and the equilibrium is the only one nearby (Deuflhard, Newton Methods for
 Nonlinear Problems, 2004)."""
 MAX_REUSE_RATIO = 0.02

@@ -230,7 +230,7 @@ class MeasuredTracks(MeasuredColumns):
 class MeasuredCurve(MeasuredColumns):
     """The force that the leader group `group` exerts along `axis` as a function of its displacement
     along this axis or, with `against: time`, of the time in steps. `thickness` is the thickness of
-    the tested body. By default `youngs_modulus` is fitted too. Units are N, mm and MPa if the
+    the tested body. By default, `youngs_modulus` is fitted too. Units are N, mm and MPa if the
     experiment has units."""
 
     type: Literal["curve"] = "curve"
@@ -437,7 +437,7 @@ class Peaks(Strict):
     curves, the peaks of which are used. `broke` is a list or the name of a column with a 1 for each
     specimen that broke and a 0 for each one that did not break before the end of its test. By
     default all specimens broke. `youngs_modulus` and `thickness` are those of the tested body. By
-    default `group` is the one with the largest displacement.
+    default, `group` is the one with the largest displacement.
     """
 
     file: str | None = None

@@ -248,7 +248,7 @@ class Fitted:
         Returns
         -------
         dict of str to Estimate
-            Amplitudes by polynomial, for instance "ux x^2 y^0". In the polynomials x and y are
+            Amplitudes by polynomial, for instance "ux x^2 y^0". In the polynomials, x and y are
             scaled so that they range from -1 to 1 over the points.
         """
         observation, columns = [*self.problem.own_slices()][n]

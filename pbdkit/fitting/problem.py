@@ -496,7 +496,7 @@ def solved(problem: Problem, start: Floats, loss: Loss = "linear") -> Solution:
     Notes
     -----
     The covariance is (JᵀJ)⁻¹. It is multiplied by the square of the ratio if residuals are larger
-    than their noise (Birge). With a loss it is that of M-estimators (Huber).
+    than their noise (Birge). With a loss, it is that of M-estimators (Huber).
     """
     low, high = problem.bounds()
     z = np.clip(start, low, high)
@@ -661,8 +661,8 @@ def rise_of_loss(residuals: Floats, unknowns: int, loss: Loss) -> float:
 def _scores(residuals: Floats, unknowns: int, loss: Loss) -> tuple[float, float]:
     """Return mean ψ², in units of the noise, and mean ψ' of the residuals.
 
-    The residuals are assumed to be at least as large as the noise. For a linear loss mean ψ² is the
-    square of Birge's ratio.
+    The residuals are assumed to be at least as large as the noise. For a linear loss, mean ψ² is
+    the square of Birge's ratio.
     """
     spread = spread_of(residuals, unknowns, loss)
     if loss == "linear":

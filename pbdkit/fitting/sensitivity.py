@@ -1,6 +1,6 @@
 """Sensitivity of an equilibrium to a parameter: ∂u/∂θ = A⁻¹ ∂m/∂θ.
 
-In equilibrium no follower moves, m(u, θ) = 0. A = -∂m/∂u is the matrix of the equilibrium solver.
+In equilibrium, no follower moves, m(u, θ) = 0. A = -∂m/∂u is the matrix of the equilibrium solver.
 Each parameter therefore requires one further solution of a linear system. ∂m/∂θ is computed from
 the moves of a few scenes with slightly different parameters. The derivatives of a scalar J = w · u
 with respect to all parameters require a single solution, λ = A⁻ᵀ w: dJ/dθ = λ · ∂m/∂θ (adjoint
@@ -158,7 +158,7 @@ class RestingScene:
 
     @cached_property
     def system(self) -> System:
-        """Return A at the equilibrium. For linear scenes it is the same as for the body at rest.
+        """Return A at the equilibrium. For linear scenes, it is the same as for the body at rest.
 
         Raises
         ------
@@ -236,7 +236,7 @@ class RestingScene:
     def along(self, function: Callable[[Floats], Floats], direction: Floats) -> Floats:
         """Return the derivative of a function of displacements along a direction.
 
-        For linear scenes it is computed by a one-sided difference, which is exact, otherwise by a
+        For linear scenes, it is computed by a one-sided difference, which is exact, otherwise by a
         central difference.
         """
         linear, u = self.finder.linear, self.state.u

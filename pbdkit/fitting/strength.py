@@ -911,7 +911,7 @@ def _plain(estimate: StrengthEstimate) -> dict[str, Any]:
 SHARES = 0.2, 0.2, 0.6
 """Fractions of the specimens that are simulated in three passes.
 
-In the first pass strengths are from the whole range between the bounds, in the next two from the
+In the first pass, strengths are from the whole range between the bounds, in the next two from the
 region in which the measurement is likely.
 """
 POINTS = 2**14

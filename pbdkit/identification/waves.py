@@ -9,7 +9,7 @@ them. The slow waves, in which all sites move nearly alike, satisfy
 
     L(k) X(k) = X(k) A(k),  A(k) = Σ_m A_m,  A_m of degree m in k,
 
-order by order, with the relative shifts of the sites eliminated. In X_0 all sites have the same
+order by order, with the relative shifts of the sites eliminated. In X_0, all sites have the same
 displacement, and Y·X = 1 with the left null vectors Y of L(0). The eigenvalues of the 2 × 2 matrix
 A(k) are the rates of the slow waves to every order: a step subtracts A(k) u from u. With one site A
 = L.

@@ -27,7 +27,7 @@ HDF5 = b"\x89HDF\r\n\x1a\n"
 LAYOUT = struct.Struct("<8s16sQ")
 """Layout of the header: the first bytes, the identity, and the number of commits."""
 HEADER_BYTES = LAYOUT.size + 8
-"""Length of the header with its digest. In the finished file the header is replaced by the
+"""Length of the header with its digest. In the finished file, the header is replaced by the
 superblock of HDF5, which is longer. Until then the superblock is stored in a page."""
 MAX_ATTEMPTS = 3
 """Number of attempts to read a header that is being written."""

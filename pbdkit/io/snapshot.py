@@ -588,7 +588,7 @@ class StateMoment(Moment):
         return read_only(self._raster.table(sums[None])[:, 0])
 
     def leader_groups(self) -> tuple[LeaderRows, ...]:
-        """Return the leader groups that are active in this step. At time 0 these are the groups
+        """Return the leader groups that are active in this step. At time 0, these are the groups
         that are active in step 1."""
         step = max(self.step, 1)
         return tuple(

@@ -78,7 +78,7 @@ def modes(eigenvalues: Complex, relaxation: float, memory: float) -> Complex:
 
     Notes
     -----
-    The result contains both roots of μ² - (1 + b - w (1 - λ)) μ + b = 0. Without momentum one of
+    The result contains both roots of μ² - (1 + b - w (1 - λ)) μ + b = 0. Without momentum, one of
     them is 1 - w (1 - λ), and the other is zero.
     """
     half = (1.0 + memory - relaxation * (1.0 - eigenvalues)) / 2.0

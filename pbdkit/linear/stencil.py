@@ -272,7 +272,7 @@ def bounds_the_body(scene: Scene) -> bool:
 
 
 def _eigenvalues(matrices: Complex) -> Complex:
-    """Compute the eigenvalues of matrices, (wave, n, n). For n = 2 they are computed in closed
+    """Compute the eigenvalues of matrices, (wave, n, n). For n = 2, they are computed in closed
     form."""
     if matrices.shape[-1] > 2:
         eigenvalues: Complex = np.linalg.eigvals(matrices)

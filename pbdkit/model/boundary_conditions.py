@@ -208,7 +208,7 @@ class LeaderGroup(Driven):
     """Particles that are leaders from step `from` to step `until`, both included.
 
     In all other steps they are followers. The steps of the motion are counted from `from`, and it
-    starts at the current positions of the particles. With `axes` the motion is prescribed along
+    starts at the current positions of the particles. With `axes`, the motion is prescribed along
     these axes only; along all others the particles are followers. Leaders that are `clamped` have
     prescribed directions, which rotate with the motion. Otherwise directions are free.
     """

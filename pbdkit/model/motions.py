@@ -191,7 +191,7 @@ class Motion(Component):
     def knots(self) -> tuple[int, ...]:
         """Return the steps n that divide the motion into parts.
 
-        Within each part the displacement is a single formula in n. By default there are no such
+        Within each part, the displacement is a single formula in n. By default there are no such
         steps, because one formula holds for all n.
         """
         return ()

@@ -247,8 +247,8 @@ class Equilibrium(Solver):
     Particles are leaders or followers as in the last step. `tolerance` is the largest distance from
     equilibrium, relative to the largest prescribed displacement. If bonds can break, the motion of
     the leaders is divided into `increments`, which can be shorter than a step, and an equilibrium
-    is computed for each. With nonlinear rules the number of increments is adaptive. `method` is the
-    method for linear systems: lu, multigrid (as the preconditioner of an iteration) or
+    is computed for each. With nonlinear rules, the number of increments is adaptive. `method` is
+    the method for linear systems: lu, multigrid (as the preconditioner of an iteration) or
     conjugate-gradients (without preconditioner); auto selects a method by the size of the system.
     """
 

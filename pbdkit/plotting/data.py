@@ -294,7 +294,7 @@ class PlottedQuantity:
 
     @property
     def is_place(self) -> bool:
-        """Return whether the quantity is a position or a particle number. For these zero has no
+        """Return whether the quantity is a position or a particle number. For these, zero has no
         special meaning."""
         return self.variable.split("_")[0] in PLACES
 
@@ -532,7 +532,7 @@ class Trajectory:
 
     @cached_property
     def _rows(self) -> Array:
-        """Rows of the particles that exist. In concatenated runs some particles may be missing."""
+        """Rows of the particles that exist. In concatenated runs, some particles may be missing."""
         reference = self._dataset["reference"].transpose("particle", "axis").values
         return np.flatnonzero(np.isfinite(reference).all(axis=1))
 

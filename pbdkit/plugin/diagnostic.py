@@ -229,7 +229,7 @@ class ForceValues(ABC):
     def on_particles(self) -> Floats:
         """Return the force that its neighbours exert on every particle, including leaders.
 
-        At broken bonds the force that the rule computes is included.
+        At broken bonds, the force that the rule computes is included.
 
         Returns
         -------

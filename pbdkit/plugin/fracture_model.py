@@ -87,7 +87,7 @@ class FractureModel(TakesFields):
     def breaks(d: Vector, r: Vector, c: Constants, p: Parameters) -> Condition:
         """Return whether the bond breaks in the intermediate configuration, elementwise.
 
-        pbdkit evaluates the function at one end of a bond only. At the other end d and r have the
+        pbdkit evaluates the function at one end of a bond only. At the other end, d and r have the
         opposite signs, so that the result must be the same for (-d, -r).
 
         Parameters

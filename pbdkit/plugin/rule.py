@@ -308,7 +308,7 @@ class Loadable(Calibrated):
 
         Notes
         -----
-        With the force f it must hold that
+        With the force f, it must hold that
         ``force(loaded(total, f, p), here, p) = force(total, here, p) + f``.
         """
 

@@ -248,7 +248,7 @@ def is_needed(field: FieldInfo) -> bool:
 def in_lengths(units: Units | None) -> tuple[float, str]:
     """Return the factor that converts lattice units to mm, and the name "mm".
 
-    Without `units` return 1 and "lattice units".
+    Without `units`, return 1 and "lattice units".
     """
     return (units.length_mm, LENGTH.unit) if units else (1.0, f"{LENGTH.lattice}s")
 

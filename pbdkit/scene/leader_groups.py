@@ -179,8 +179,8 @@ def _meeting(leading: list[Leading], steps: int) -> Iterator[tuple[int, int]]:
 
 
 def kinds_at(raster: Raster, leading: Iterable[Leading], step: int) -> NDArray[np.int8]:
-    """Return the kind of every particle during a step, (particle,). At time 0 it is the kind during
-    step 1."""
+    """Return the kind of every particle during a step, (particle,). At time 0, it is the kind
+    during step 1."""
     kinds = raster.table_kind.copy()
     for leaders in leading:
         if leaders.group.leads(max(step, 1)):

@@ -305,7 +305,7 @@ class Analysis:
     def largest_stable_relaxation(self) -> float | None:
         """Return the relaxation below which all modes decay, with the momentum of the experiment.
 
-        With the momentum b it is 2 (1 + b) / (1 - λ_min) if the eigenvalues are real.
+        With the momentum b, it is 2 (1 + b) / (1 - λ_min) if the eigenvalues are real.
         """
         rule_spectrum, memory = self.spectra.of_rule, self.scene.experiment.stepping.memory
         return (
@@ -562,8 +562,8 @@ class StabilityEstimate:
 
     @cached_property
     def at_rest(self) -> State:
-        """Return the initial state with all displacements set to zero. In this state particles with
-        equal neighbourhoods have the same response."""
+        """Return the initial state with all displacements set to zero. In this state, particles
+        with equal neighbourhoods have the same response."""
         state = initial_state(self._scene)
         return replace(state, u=np.zeros_like(state.u))
 

@@ -288,7 +288,7 @@ def _reached_about(
     """Compute max |e| after some steps without momentum, with an accuracy of 10 %. The formula is e
     = (1 - Pⁿ) A⁻¹ push.
 
-    For few steps the increments are added without decay. For more steps, P is projected onto the
+    For few steps, the increments are added without decay. For more steps, P is projected onto the
     span of A⁻¹ push and A⁻² push.
     """
     if scene.frame_delay or scene.experiment.stepping.memory:

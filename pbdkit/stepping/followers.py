@@ -44,7 +44,7 @@ class Followers(ABC):
         """Write the displacements of all body particles into `new`, from the intermediate
         configuration m.
 
-        On entry `new` contains the displacements at the beginning of the previous step, from which
+        On entry, `new` contains the displacements at the beginning of the previous step, from which
         the momentum is computed. Particles without neighbours stay. The values of leaders are
         overwritten later. `state` is the state at the end of the previous step; its state variables
         of particles are updated in place.
@@ -186,7 +186,7 @@ class GatheringFollowers(Followers):
 
     def move(self, m: Floats, new: Floats, state: State) -> None:
         """Move all particles from the intermediate configuration m. In scenes with re-evaluated
-        neighbours bonds do not break."""
+        neighbours, bonds do not break."""
         flat, count = new.reshape(len(new), -1), len(self._place)
         u, previous = m.reshape(len(m), -1)[:, self._place], flat[:, self._place]
         j, k, rest = self._search.pairs(m)

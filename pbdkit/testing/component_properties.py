@@ -738,7 +738,7 @@ def is_seen_alike_from_both_ends(subject: Subject) -> None:
 def _from_the_other_end(names: list[str]) -> list[int]:
     """Return the index of each state variable as seen from the other end of a bond.
 
-    From the other end left and right are exchanged.
+    From the other end, left and right are exchanged.
     """
     turned = {"_left": "_right", "_right": "_left"}
     swapped = [
@@ -749,7 +749,7 @@ def _from_the_other_end(names: list[str]) -> list[int]:
 
 @property_of(FractureModel)
 def breaks_as_declared(subject: Subject) -> None:
-    """With `can_break = False` no bond breaks at any length: the scene then has no bond state."""
+    """With `can_break = False`, no bond breaks at any length: the scene then has no bond state."""
     scene = subject.scene
     if subject.component.can_break:
         return

@@ -73,7 +73,7 @@ def torn_state(scene: Scene, seed: int, initial: State) -> State:
 def softened_state(scene: Scene, seed: int) -> State:
     """Return the state at rest after a random displacement that has been reversed.
 
-    During the displacement bonds have broken and softened according to the fracture model. Further
+    During the displacement, bonds have broken and softened according to the fracture model. Further
     bonds are broken at random.
     """
     state = Stepper(scene).advance(state_with(scene, displacements(scene, seed, share=0.3)), 1)

@@ -131,7 +131,7 @@ def rests(subject: Subject) -> None:
 def _refuse_to_leave_rest(scene: Scene) -> None:
     """Raise PropertyError if a particle with all its neighbours moves from rest.
 
-    Without a frame particles at edges may move.
+    Without a frame, particles at edges may move.
     """
     for slots in scene.neighbourhood.slots:
         largest = max(abs(float(component)) for component in Evaluator(scene).at_rest(slots))

@@ -521,7 +521,7 @@ def role_of(dataset: xarray.Dataset) -> Array:
 
 def _particles_over_time(each: Iterator[Array], rows: Rows) -> tuple[Array, dict[str, Any]]:
     """Return the values of some rows, (particle, ..., time). Also return, for each time, the mean,
-    the maximum and the minimum over all rows. For vectors these are statistics of the lengths."""
+    the maximum and the minimum over all rows. For vectors, these are statistics of the lengths."""
     selection, statistics = [], []
     for values in each:
         selection.append(values[rows])

@@ -115,7 +115,7 @@ class Camera:
         self, scene: Scene, state: State, end: int, pictures: int, step_s: float
     ) -> ViewFrame:
         """Return the frame of a state."""
-        # In a diverging run displacements may be too large for single precision.
+        # In a diverging run, displacements may be too large for single precision.
         with np.errstate(over="ignore"):
             positions = self.positions(state).astype(np.float32)
             values = self._values(state)

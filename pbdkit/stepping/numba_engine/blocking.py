@@ -6,7 +6,7 @@ the first axis into bands. In each band all steps of the pass are made one after
 region of each step is shifted against the region of the previous step along both axes (time
 skewing); the class `Skew` contains the distances.
 
-On several threads the rows are divided into pieces, which are computed in parallel. From step to
+On several threads, the rows are divided into pieces, which are computed in parallel. From step to
 step a piece has fewer rows at its ends, because the rows of the adjacent pieces must not be read.
 The gaps that remain between the pieces are computed in parallel afterwards.
 """

@@ -161,8 +161,8 @@ class LatticeWriter(PlanWriter):
 def write_pass(
     out: Function, plan: Plan, depth: int, one: Function, low: str, high: str, *more: str
 ) -> None:
-    """Write a call for the rows from `low` to `high`. On several threads it is called for a part of
-    the rows on each thread."""
+    """Write a call for the rows from `low` to `high`. On several threads, it is called for a part
+    of the rows on each thread."""
     if not plan.parallel:
         out.add(depth, one.call(low, high, *more))
         return

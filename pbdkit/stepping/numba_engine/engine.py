@@ -248,7 +248,7 @@ def _growth(program: Program) -> Box:
 
 BAND = 16384
 """Number of places in a band. Bonds are updated in one band and then the sweep moves the particles
-of the band, so that the data stay in the cache. On several threads bands are larger, because
+of the band, so that the data stay in the cache. On several threads, bands are larger, because
 starting threads takes time."""
 
 
