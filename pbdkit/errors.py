@@ -113,7 +113,7 @@ class DivergedError(PbdkitError):
         Text for the user.
     dataset : xarray.Dataset, optional
         The records before the failure, with the status "diverged", "unconverged" or "separated".
-        None if the run writes to a file, because the file contains these records.
+        It is None if the run writes to a file, because the file contains these records.
     """
 
     exit_status = 4

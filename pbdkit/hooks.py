@@ -269,8 +269,8 @@ def installed_plugins(group: str = GROUP) -> list[Plugin]:
     They are not loaded.
 
     A distribution with unreadable metadata is returned as a broken plugin, and one that the user
-    disables as a disabled plugin. Of two distributions with the same name, the first on the Python
-    path is used.
+    disables as a disabled plugin. If two distributions have the same name, the first one on the
+    Python path is used.
     """
     names: set[str] = set()
     plugins: list[Plugin] = []

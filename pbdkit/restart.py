@@ -327,7 +327,7 @@ def resumption(
     Returns
     -------
     Resumption or None
-        None if all steps were already done. The result then has its final name.
+        The result is None if all steps were already done. The result then has its final name.
 
     Raises
     ------

@@ -64,7 +64,7 @@ def counted(sections: list[Section]) -> str:
     head = ["| part of the paper | reproduced | only with changes | not reproduced |"]
     rows = [f"| {name} | {' | '.join(str(n[v]) for v in VERDICTS)} |" for name, n in table.items()]
     return (
-        f"Of {total.total()} claims {total[OUT]} are reproduced, {total[ONLY]} only with the named "
-        f"changes, and {total[NOT]} are not reproduced:\n\n"
+        f"The table counts {total.total()} claims. {total[OUT]} are reproduced, {total[ONLY]} only "
+        f"with the named changes, and {total[NOT]} are not reproduced:\n\n"
         + "\n".join([*head, "| --- | --- | --- | --- |", *rows])
     )

@@ -180,7 +180,7 @@ DISABLE_ONE = f"name one of them in {DISABLE} to use the other"
 
 
 def _sections() -> dict[str, list[tuple[str, str]]]:
-    """Return the lines of `pbdkit --help`, (command, sentence), by group."""
+    """Return the lines of `pbdkit --help` as pairs of command and sentence, by group."""
     sections: dict[str, list[tuple[str, str]]] = {group: [] for group in GROUPS}
     for command in builtin_commands().values():
         sections[command.group].append((command.name, command.does))

@@ -583,7 +583,7 @@ def reactions(now: Moment) -> Floats:
     Returns
     -------
     NDArray
-        Reactions, (leader group, axis); 0 along axes on which no motion is prescribed.
+        Reactions of shape (leader group, axis); 0 along axes on which no motion is prescribed.
     """
     forces, groups = forces_on_particles(now), now.leader_groups()
     touching = now.touching()

@@ -58,7 +58,8 @@ def rectangle_matrix(c: Stiffness, a: float, b: float) -> Floats:
     Returns
     -------
     NDArray
-        Stiffness divided by modulus and thickness, (corner, axis, corner, axis); read-only.
+        Read-only array of shape (corner, axis, corner, axis): the stiffness divided by modulus and
+        thickness.
     """
     # The gradient of the bilinear displacement in the middle: ∂N/∂x = ±1/(2a), ∂N/∂y = ±1/(2b).
     K = _of_mean_strain(c, CORNERS / (2 * np.array([a, b])), a * b)

@@ -62,9 +62,9 @@ class _Level:
 
 class SparseGrids:
     """Approximation of A⁻¹ r by one V-cycle in single precision. The matrix has `axes` unknowns for
-    each particle, which are stored next to each other. The arrays `places` and `led`, (particle,
-    axis of space), are the positions of the particles and of the leaders. `held` marks prescribed
-    unknowns, which are not interpolated."""
+    each particle, which are stored next to each other. The arrays `places` and `led` of shape
+    (particle, axis of space) are the positions of the particles and of the leaders. `held` marks
+    prescribed unknowns, which are not interpolated."""
 
     def __init__(
         self, matrix: Any, axes: int, places: Floats, led: Floats, held: Mask | None = None
@@ -122,10 +122,10 @@ def _spacing(places: Floats) -> Floats:
 
 
 def _hats(A: Any, axes: int, at: Floats, led: Floats) -> tuple[Any, Floats]:
-    """Return the hats as a matrix, (unknown, unknown of the next grid), and the points at which the
-    hats are centred. The positions `at` of the particles and `led` of the leaders are in units of
-    the spacing of the next grid. A point has no hat if a leader is nearer to it than any other
-    particle."""
+    """Return the hats as a matrix of shape (unknown, unknown of the next grid), and the points at
+    which the hats are centred. The positions `at` of the particles and `led` of the leaders are in
+    units of the spacing of the next grid. A point has no hat if a leader is nearer to it than any
+    other particle."""
     from scipy.sparse import csr_array, eye_array, kron
 
     low = np.floor(np.minimum(at.min(axis=0), led.min(axis=0, initial=0.0))).astype(int) - 1

@@ -128,7 +128,7 @@ class ContactSystem(System):
         return planes.reshape(len(planes), -1)[:, self._place].T.ravel()
 
     def _planes(self, table: Floats) -> Floats:
-        """Return a vector, (unknown,), as planes."""
+        """Return a vector of shape (unknown,) as planes."""
         planes = np.zeros(self._shape)
         planes.reshape(len(planes), -1)[:, self._place] = table.reshape(-1, len(planes)).T
         return planes

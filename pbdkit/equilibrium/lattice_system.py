@@ -120,8 +120,8 @@ TURN = 3
 
 @dataclass(frozen=True)
 class SlowMode:
-    """Mode of the steps that decays most slowly. `planes` are its displacements, (axis, sublattice,
-    cell, cell), and `slowness` is 1 / (1 - λ) with its eigenvalue λ."""
+    """Mode of the steps that decays most slowly. `planes` of shape (axis, sublattice, cell, cell)
+    are its displacements, and `slowness` is 1 / (1 - λ) with its eigenvalue λ."""
 
     planes: Floats
     slowness: float

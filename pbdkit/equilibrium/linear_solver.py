@@ -63,9 +63,9 @@ WIDEST = 0.25
 class Coordinates:
     """Coordinates of the unknowns, `axes` for each particle, stored next to each other.
 
-    The class contains the positions of the particles and of the leaders, (particle, axis of space),
-    and a mask of the `held` unknowns. The row and the column of a held unknown contain only the
-    diagonal entry. The mask is None if no unknown is held.
+    The class contains the positions of the particles and of the leaders, as arrays of shape
+    (particle, axis of space), and a mask of the `held` unknowns. The row and the column of a held
+    unknown contain only the diagonal entry. The mask is None if no unknown is held.
     """
 
     axes: int

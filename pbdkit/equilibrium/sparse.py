@@ -317,9 +317,9 @@ class SingularSubsystem(Subsystem):
 
 
 def _left_kernel(matrix: Any) -> Floats:
-    """Return an orthonormal basis, (unknown, mode), of all y with yᵀ A = 0 within rounding. For
-    large matrices it is computed by inverse iteration. Compared with vectors of the kernel, each
-    iteration multiplies a mode with the eigenvalue λ by about SHIFT / λ."""
+    """Return an orthonormal basis of shape (unknown, mode) of all y with yᵀ A = 0 within rounding.
+    For large matrices it is computed by inverse iteration. Compared with vectors of the kernel,
+    each iteration multiplies a mode with the eigenvalue λ by about SHIFT / λ."""
     size = matrix.shape[0]
     largest = float(abs(matrix).max()) if size else 0.0
     if not largest > 0.0:
@@ -433,7 +433,7 @@ class MatrixSystem(System):
         return planes.reshape(len(planes), -1)[:, self._place].T
 
     def _planes(self, table: Floats) -> Floats:
-        """Return a table, (follower, axis), as planes."""
+        """Return a table of shape (follower, axis) as planes."""
         planes = np.zeros(self._shape)
         planes.reshape(len(planes), -1)[:, self._place] = table.T
         return planes
@@ -516,8 +516,9 @@ class MatrixSystem(System):
         return self._planes(solution)
 
     def _invariant_change(self, state: State) -> Floats | None:
-        """Return before · (u(t-1) - u(t)), (follower, axis), by which the previous state changes
-        the invariants. Return None if a step does not depend on the previous state."""
+        """Return the array before · (u(t-1) - u(t)) of shape (follower, axis), by which the
+        previous state changes the invariants. Return None if a step does not depend on the previous
+        state."""
         if not self._operator.couplings_previous.parts:
             return None
         u, previous = self._table(state.u), self._table(state.previous)

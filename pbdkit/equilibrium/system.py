@@ -4,7 +4,7 @@
 `Rows` describes the rows of the lattice that a process stores, and offers the collective operations
 among the processes that share the lattice. Fields are arrays (…, row, place). Sums over the whole
 lattice are computed row by row, so that they do not depend on the number of processes. Moves and
-displacements are planes, (axis, sublattice, cell, cell), as in a state.
+displacements are planes of shape (axis, sublattice, cell, cell) as in a state.
 """
 
 from __future__ import annotations

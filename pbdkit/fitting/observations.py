@@ -1151,7 +1151,8 @@ def deeper(body: Body, lattice: Lattice, points: Floats, margin: float) -> NDArr
 
 
 def depths(body: Body, lattice: Lattice, points: Floats) -> Floats:
-    """Return the distance of points to the outline of a body, (point,); it is negative outside."""
+    """Return an array of shape (point,) with the distances of points to the outline of a body. They
+    are negative outside."""
     region = _region(body, lattice, tolerance_of(body, lattice))
     if region.is_empty:
         return np.zeros(len(points))

@@ -200,7 +200,8 @@ class RestingScene:
         return self._with_frame(direct, self._solve(moves, parameter.path.encode()))
 
     def gradient(self, weights: Floats, parameters: Sequence[Parameter]) -> Floats:
-        """Return dJ/dθ of J = Σ weights · u, (parameter,), by one solution for all parameters.
+        """Return the derivatives dJ/dθ of J = Σ weights · u in an array of shape (parameter,). One
+        solution is sufficient for all parameters.
 
         Parameters
         ----------

@@ -90,17 +90,17 @@ class BondStrains:
     count: Floats
 
     def at(self, load: Floats) -> Floats:
-        """Return the strains ε, (load, bond); 0 for compressed bonds."""
+        """Return the strains ε of shape (load, bond); 0 for compressed bonds."""
         x = load[:, None] * (2.0 * self.p + load[:, None] * self.q)
         return np.asarray(np.maximum(x, 0.0) / (np.sqrt(1.0 + np.maximum(x, 0.0)) + 1.0))
 
     def rate(self, load: Floats) -> Floats:
-        """Return dε/dλ, (load, bond), where ε > 0."""
+        """Return dε/dλ of shape (load, bond), where ε > 0."""
         return np.asarray((self.p + load[:, None] * self.q) / (1.0 + self.at(load)))
 
     def load_at(self, strain: Floats) -> Floats:
-        """Return the load factor at which each bond reaches a strain, (bond,); infinite for bonds
-        without strain."""
+        """Return an array of shape (bond,) with the load factor at which each bond reaches a
+        strain. It is infinite for bonds without strain."""
         x = strain * (2.0 + strain)
         with np.errstate(divide="ignore", invalid="ignore"):
             load = x / (self.p + np.sqrt(self.p**2 + self.q * x))
@@ -484,7 +484,8 @@ LawBounds = tuple[tuple[float, float], tuple[float, float]]
 
 @dataclass(frozen=True)
 class Breaks:
-    """Load factors of specimens, (specimen,), and whether each specimen broke or survived."""
+    """Load factors of specimens, in an array of shape (specimen,), and whether each specimen broke
+    or survived."""
 
     load: Floats
     broke: Mask
@@ -492,7 +493,7 @@ class Breaks:
 
 @dataclass(frozen=True)
 class WeightedSamples:
-    """Samples of the parameters, (draw, parameter), with their weights."""
+    """Samples of the parameters, in an array of shape (draw, parameter), and their weights."""
 
     values: Floats
     weights: Floats

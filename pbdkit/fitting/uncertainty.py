@@ -395,7 +395,7 @@ def _walk(
 
 
 def _refine(side: Floats, problem: Problem, solution: Solution, n: int, loss: Loss) -> Floats:
-    """Insert values, (value, 2), where the rise reaches RISE_95.
+    """Insert values of shape (value, 2) where the rise reaches RISE_95.
 
     The square root of the rise is not linear near this value if the profile is flat near the fit.
     """

@@ -70,7 +70,7 @@ class Elasticity:
     def axis(self) -> float | None:
         """Return the direction of an axis of symmetry in degrees, 0 to 90.
 
-        None if the body is isotropic or has no such axis.
+        It is None if the body is isotropic or has no such axis.
         """
         fourth, second = self._harmonics
         if self.symmetry in ("isotropic", "general"):
@@ -101,7 +101,7 @@ class Elasticity:
     def zener(self) -> float | None:
         """Return 4 C66 / (C11 + C22 - 2 C12) in x and y, 1 for isotropic bodies.
 
-        None if stretching along x and shrinking along y costs no energy.
+        It is None if stretching along x and shrinking along y costs no energy.
         """
         (c11, c12, _), (_, c22, _), (*_, c66) = self.stiffness
         stretching = c11 + c22 - 2 * c12

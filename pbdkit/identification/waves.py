@@ -241,7 +241,7 @@ def slow_waves(stencil: Primitive) -> SlowWaves | str:
 
 
 def operator(stencil: Primitive, k: Floats) -> Complex:
-    """Return L(k) for waves k, (wave, axis), as matrices (wave, 2S, 2S) for S sites.
+    """Return L(k) for waves k of shape (wave, axis) as matrices (wave, 2S, 2S) for S sites.
 
     A step multiplies a wave by 1 - L(k).
     """
@@ -256,8 +256,8 @@ def _moment(stencil: Primitive, direction: Floats, m: int) -> Complex:
 
 
 def _coupled(stencil: Primitive, weight: Complex, share: float) -> Complex:
-    """Return Σ weight W over the entries, (wave, entry), by pairs of sites, plus `share` times
-    W_0."""
+    """Return Σ weight W over the entries, plus `share` times W_0. The weights have the shape (wave,
+    entry), and the result is given by pairs of sites."""
     sites = stencil.sites
     result = np.zeros((len(weight), sites, 2, sites, 2), complex)
     for e, (s, t) in enumerate(zip(stencil.source, stencil.target, strict=True)):

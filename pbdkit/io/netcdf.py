@@ -208,8 +208,8 @@ def _fill(variable: Any, values: Array | PiecedArray) -> None:
 
 
 def _parts(entries: list[Any], chunks: tuple[int, ...]) -> Iterator[tuple[int, Array]]:
-    """Generate the chunks of entries, (entry, ...), along their first dimension, and the position
-    at which each chunk starts."""
+    """Generate the chunks of entries of shape (entry, ...) along their first dimension, and the
+    position at which each chunk starts."""
     if isinstance(entries[0], PiecedArray):
         for n, rows in enumerate(entries[0].rows(chunks[1])):
             yield n * chunks[1], rows[None]

@@ -207,7 +207,7 @@ class Tables:
         return tables
 
     def add_reference(self, u: Floats) -> Floats:
-        """Add X to u, (particle, axis), in place. If more than two steps are recorded, X is
+        """Add X to u of shape (particle, axis) in place. If more than two steps are recorded, X is
         computed once and stored; otherwise it is computed in chunks, which saves memory."""
         experiment = self.scene.experiment
         if experiment.record_count > 2:
@@ -218,7 +218,8 @@ class Tables:
         return u
 
     def of_body(self, planes: Floats) -> Floats:
-        """Convert values on rasters to a table, (particle, ...), with NaN at frame points."""
+        """Convert values on rasters to a table of shape (particle, ...), with NaN at frame
+        points."""
         table = self.scene.raster.table(planes)
         table[~self.body] = np.nan
         return read_only(table)
@@ -339,9 +340,9 @@ def _mean_gradient(d: Sequence[Floats], r: Sequence[Any]) -> tuple[Any, Any]:
 def _extend_gradient(
     gradient: Floats, phase_cells: list[tuple[Patch, Floats]], cells: list[tuple[Patch, Floats]]
 ) -> Floats:
-    """Extend a gradient, (4, ...), that was computed from some cells only, to particles without
-    such cells. Their gradient is the mean over the particles with which they share any cell, or NaN
-    if none of these particles has a gradient."""
+    """Extend a gradient that was computed from some cells only to particles without such cells. Its
+    shape is (4, ...). Their gradient is the mean over the particles with which they share any cell,
+    or NaN if none of these particles has a gradient."""
     shape = gradient.shape[1:]
     weight, total, count = np.zeros(shape), np.zeros_like(gradient), np.zeros(shape)
     for patch, share in phase_cells:
@@ -558,8 +559,8 @@ class StateMoment(Moment):
         return read_only(self._raster.reference(rows))
 
     def position(self) -> Floats:
-        """Return x = X + u, (particle, axis), always in float64, independent of the precision of
-        the run."""
+        """Return x = X + u of shape (particle, axis), always in float64, independent of the
+        precision of the run."""
         return self._tables.add_reference(
             self._raster.table(self._state.u).astype(float, copy=False)
         )

@@ -95,7 +95,8 @@ def grid_of(dataset: xarray.Dataset, scene: Scene | None) -> UnstructuredGrid:
 
 
 def polygons_of(scene: Scene) -> list[Array]:
-    """Return the rows of the corners of the body's cells, (cell, corner), grouped by shape."""
+    """Return arrays of shape (cell, corner) with the rows of the corners of the body's cells. There
+    is one array for each kind of polygon."""
     corners_by_size: dict[int, list[Array]] = {}
     for patch in scene.patches:
         places = np.argwhere(patch.whole)

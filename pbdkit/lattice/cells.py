@@ -127,8 +127,8 @@ class WeighedCells:
         Cells of the lattice.
     share
         Area fraction of each cell inside the outline, from 0 to 1, stored at the place of the first
-        corner of the cell. The shape is (kind, sublattice, cell, cell). None if all cells are
-        whole.
+        corner of the cell. The shape is (kind, sublattice, cell, cell). The array is None if all
+        cells are whole.
     weight
         Area fraction of each cell, times the ratio of the stiffness of the cell to the stiffness of
         the rule; 0 for the cells in `mixed`.

@@ -56,7 +56,7 @@ class Filling:
         Site index of the first entry of `body`.
     share
         Area fractions of the cells inside the outline, at the site of their first corner, (kind, i,
-        j). None if cells are not weighted.
+        j). It is None if cells are not weighted.
     left_out
         Cells omitted at narrow voids, given by the sites of their first corners, (cell, axis).
     """
@@ -69,7 +69,7 @@ class Filling:
     @property
     def box(self) -> tuple[Index, Index] | None:
         """Smallest window of site indices that contains all particles of the body, (low, high).
-        None if there is no particle."""
+        The result is None if there is no particle."""
         if not (ends := bounds(self.body)):
             return None
         low, high = (tuple(map(add, self.first, end)) for end in ends)
@@ -461,9 +461,9 @@ class _Cutter:
         Returns
         -------
         tuple
-            Shares at the place of the first corner, 0 where there is no cell; and the places,
-            (cell, axis), of cells with a noticeable share that are omitted because the region
-            inside the outline is disconnected in them.
+            Shares at the place of the first corner, 0 where there is no cell; and the places
+            of shape (cell, axis) of cells with a noticeable share that are omitted because the
+            region inside the outline is disconnected in them.
         """
         steps, first_corners = (
             [corner.site for corner in polygon.corners],
@@ -501,7 +501,7 @@ class _Cutter:
         """Find the cells that are connected to other cells only by a particle outside the outline.
 
         Around such a particle two neighbouring cells are connected if part of the edge between them
-        is inside. Of the connected groups of cells around the particle, only the group with the
+        is inside. The cells around the particle form connected groups; only the group with the
         largest area is retained. If several groups have the largest area, none is retained;
         otherwise mirror images of a body would not have mirror images of its cells.
 
@@ -551,7 +551,8 @@ class _Cutter:
         return np.asarray(is_in_window & ((far < 0.0) | (far == 0.0) & is_wide))
 
     def _partly_inside(self, start: Indices, end: Indices) -> Mask:
-        """Return whether part of the segments between places, (place, axis), is inside."""
+        """Return whether part of the segments between places is inside. The shape of places is
+        (place, axis)."""
         ends = tuple(start.T), tuple(end.T)
         a, b = (np.stack([plane[place] for plane in self._at]) for place in ends)
         part = np.arange(1, FINER)[:, None] / FINER
@@ -581,8 +582,8 @@ def shares_inside(
     Returns
     -------
     tuple
-        Shares, (cell,); and a mask of the cells in which the outline may be something other than
-        one straight line or a wide arc.
+        Shares of shape (cell,); and a mask of the cells in which the outline may be something other
+        than one straight line or a wide arc.
 
     Notes
     -----
@@ -754,7 +755,8 @@ def _distinct_rows(at: Indices) -> Indices:
 
 
 def _values(plane: NDArray[Any], at: Indices) -> NDArray[Any]:
-    """Return the values at places, (place, axis); 0 outside the plane."""
+    """Return the values at places, given in an array of shape (place, axis); 0 outside the
+    plane."""
     inside = ((at >= 0) & (at < plane.shape)).all(axis=1)
     values = np.zeros(len(at), plane.dtype)
     values[inside] = plane[tuple(at[inside].T)]
@@ -772,8 +774,8 @@ def _group_count(exists: Mask, joined: Mask) -> Indices:
 
 
 def _smaller_groups(share: Floats, joined: Mask) -> Mask:
-    """Return a mask, (cell, particle), of the cells around particles that do not belong to the
-    largest connected group."""
+    """Return a mask of shape (cell, particle) of the cells around particles that do not belong to
+    the largest connected group."""
     exists = share > 0.0
     links = exists & np.roll(exists, 1, axis=0) & joined
     number = np.broadcast_to(np.arange(len(share))[:, None], share.shape).copy()
@@ -809,9 +811,9 @@ def cut_by_border(
     Returns
     -------
     tuple
-        Shares, (cell,); and the integral of n nᵀ over the outline in each cell, (cell, 2, 2), where
-        n is the normal of the outline. Both sides of a thin layer make the same contribution to the
-        integral.
+        Shares of shape (cell,); and an array of shape (cell, 2, 2) with the integral of n nᵀ over
+        the outline in each cell, where n is the normal of the outline. Both sides of a thin layer
+        make the same contribution to the integral.
 
     Notes
     -----
@@ -874,7 +876,8 @@ def _across(at: Floats, distance: Floats) -> Floats:
 
 
 def _in_four(at: Floats) -> Floats:
-    """Divide each triangle, (axis, corner, triangle), into four triangles of half its width."""
+    """Divide each triangle into four triangles of half its width. The shape of triangles is (axis,
+    corner, triangle)."""
     a, b, c = at.swapaxes(0, 1)
     ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
     corners = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (bc, ca, ab)]
@@ -933,9 +936,9 @@ def _mesh(n: int) -> tuple[Floats, Indices]:
     Returns
     -------
     tuple
-        Weights of the corners at each point, (point, corner); points at the ends of each edge,
-        (edge, end). The first points are the corners of the cell. All other points on the border
-        are moved slightly inward.
+        Array of shape (point, corner) with the weights of the corners at each point, and array of
+        shape (edge, end) with the points at the ends of each edge. The first points are the corners
+        of the cell. All other points on the border are moved slightly inward.
     """
     fine, small = _small_triangles(FINER)
     corners = np.concatenate([np.eye(n), np.full((1, n), 1 / n)])
@@ -969,8 +972,8 @@ def _small_triangles(fine: int = FINE) -> tuple[Floats, Indices]:
     Returns
     -------
     tuple
-        Barycentric coordinates of the points, (point, corner); points at the corners of each small
-        triangle, (triangle, corner).
+        Array of shape (point, corner) with the barycentric coordinates of the points, and array of
+        shape (triangle, corner) with the points at the corners of each small triangle.
     """
     k, m = (n.ravel() for n in np.indices((fine + 1, fine + 1)))
     inside = k + m <= fine

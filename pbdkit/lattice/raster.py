@@ -428,7 +428,8 @@ class Raster:
         return self.rows_of_sites(whole * cell.period + index[s])
 
     def rows_of_sites(self, site: NDArray[Any]) -> Indices:
-        """Return the row of the particle at each site, (entry, index); -1 if there is none."""
+        """Return the row of the particle at each site; -1 if there is none. The sites are an array
+        of shape (entry, index)."""
         place = site.astype(np.intp) - self.low
         inside = ((place >= 0) & (place < self.sites.shape)).all(axis=-1)
         rows = np.full(inside.shape, -1, np.intp)
@@ -458,8 +459,8 @@ class Raster:
         return positions(self.cell, s, *cells)
 
     def table(self, u: NDArray[Any]) -> NDArray[Any]:
-        """Convert values on rasters, (axis, sublattice, cell, cell), to a table (particle,
-        axis)."""
+        """Convert values on rasters, in an array of shape (axis, sublattice, cell, cell), to a
+        table of shape (particle, axis)."""
         if not self._full:
             flat = u.reshape(len(u), -1)
             return self._of_all(lambda rows: flat.take(self.place_of(rows), 1).T, len(u), u.dtype)

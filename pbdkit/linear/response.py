@@ -188,8 +188,8 @@ def _group_alike(
 
 
 def _is_regular(scene: Scene, state: State, sublattice: int) -> Present:
-    """Return which places of a sublattice, (cell, cell), have all neighbours, whole cells around
-    them and no broken bond."""
+    """Return a mask of shape (cell, cell) of those places of a sublattice that have all neighbours,
+    whole cells around them and no broken bond."""
     raster, around = scene.raster, scene.neighbourhood
     regular = np.zeros(raster.shape[1:], bool)
     if not (block := raster.body_block(sublattice)):

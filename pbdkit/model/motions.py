@@ -61,7 +61,8 @@ def in_place_of(
     Returns
     -------
     tuple or None
-        The parameters without `file`, and the rows of the columns. None if no file is given.
+        The parameters without `file`, and the rows of the columns. The result is None if no file is
+        given.
     """
     if not isinstance(parameters, dict) or parameters.get("file") is None:
         return None
@@ -185,7 +186,8 @@ class Motion(Component):
         Returns
         -------
         NDArray
-            Displacements, (particle, axis), or (axis,) if they are the same for all particles.
+            Displacements of shape (particle, axis), or (axis,) if they are the same for all
+            particles.
         """
 
     def knots(self) -> tuple[int, ...]:
@@ -266,7 +268,8 @@ class Measured(Motion):
         return (self.ramp,)
 
     def at(self, places: Floats) -> Floats:
-        """Return the measured displacements at places, (place, axis); NaN outside the points."""
+        """Return the measured displacements at places, as an array of shape (place, axis); NaN
+        outside the points."""
         key = places.tobytes()
         if key not in self._cache:
             self._cache.clear()

@@ -56,8 +56,8 @@ class FileResolver:
     Parameters
     ----------
     folder
-        The folder. None for an experiment that cannot refer to files; for example, an experiment in
-        a result contains the contents of its files instead.
+        The folder. It is None for an experiment that cannot refer to files; for example, an
+        experiment in a result contains the contents of its files instead.
     outside
         Whether files outside the folder are permitted, as for a dict in a Python program. The
         environment variable `ALLOW_OUTSIDE` permits them too.

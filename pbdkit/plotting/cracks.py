@@ -98,8 +98,9 @@ def draw_crack(dataset: xarray.Dataset, kind: Kind, ax: Axes | None) -> Axes:
 
 @dataclass(frozen=True)
 class CrackBonds:
-    """Broken bonds of the body in the order of breaking. `step` is the step of breaking; `ends`,
-    (bond, end, axis), and `middle` are the positions of the ends and of the midpoints at rest."""
+    """Broken bonds of the body in the order of breaking. `step` is the step of breaking; `ends`
+    of shape (bond, end, axis) and `middle` are the positions of the ends and of the midpoints at
+    rest."""
 
     step: Array
     ends: Array

@@ -99,8 +99,8 @@ def _greatest(values: Any, dim: str) -> Floats:
 
 
 def _displacements(dataset: xarray.Dataset, dim: str) -> Any:
-    """Return the mean displacement, (time, group, axis), of the particles or obstacles that exert
-    the force. The result has units as an attribute."""
+    """Return the mean displacement, as an array of shape (time, group, axis), of the particles or
+    obstacles that exert the force. The result has units as an attribute."""
     if dim == "load":
         return in_units(dataset["load_displacement"])
     if extra_dims := [str(d) for d in dataset[FORCE_OF[dim]].dims if d not in OF_A_RUN]:

@@ -42,8 +42,8 @@ exceeds this number."""
 
 
 def cells_of(site: Array, reference: Array) -> Array:
-    """Return the rows of the corners of each cell, (cell, 4), in their order around the cell. In
-    triangles the last corner occurs twice.
+    """Return an array of shape (cell, 4) with the rows of the corners of each cell, in their order
+    around the cell. In triangles the last corner occurs twice.
 
     `site` (particle, 2) are whole numbers. If the positions of the sites (i, j) repeat along i, as
     on Bravais lattices, the cells are the cells of the Delaunay tessellation of the lattice:
@@ -58,8 +58,8 @@ def cells_of(site: Array, reference: Array) -> Array:
 
 
 def triangles_of(reference: Array) -> Array:
-    """Return the Delaunay triangles, (triangle, 3), except triangles that bridge gaps. There are
-    none if all places are collinear."""
+    """Return the Delaunay triangles, as an array of shape (triangle, 3). Triangles that bridge gaps
+    are omitted. There are none if all places are collinear."""
     from scipy.spatial import Delaunay, QhullError
 
     try:
@@ -119,8 +119,8 @@ def _steps(rows: Array, reference: Array, axis: int) -> Array:
 
 
 def whole(cells: Array, pairs: Array, particles: int) -> Array:
-    """Return a mask, (cell,), of the cells in which none of the pairs of rows, (pair, 2), is a side
-    or a diagonal."""
+    """Return a mask of shape (cell,) of the cells in which none of the pairs is a side or a
+    diagonal. The pairs are rows in an array of shape (pair, 2)."""
     intact = np.ones(len(cells), np.bool_)
     if not len(pairs):
         return intact
@@ -181,10 +181,11 @@ def lattice_unit(dataset: xarray.Dataset) -> float:
 class CutCells:
     """The cells that are cut by an outline.
 
-    `distance`, (cut cell, point, point), is the signed distance, positive outside the outline, at
-    points [v, u] of the cell. The coordinates u and v run from 0 to 1 along the sides of the cell;
-    a point is the mean of the four corners with the weights (1 - u)(1 - v), u(1 - v), uv and (1 -
-    u)v. `row`, (cell,), is the row of each cell in `distance`, and -1 if the cell is not cut.
+    `distance` of shape (cut cell, point, point) is the signed distance, positive outside the
+    outline, at points [v, u] of the cell. The coordinates u and v run from 0 to 1 along the sides
+    of the cell; a point is the mean of the four corners with the weights (1 - u)(1 - v), u(1 - v),
+    uv and (1 - u)v. `row` of shape (cell,) is the row of each cell in `distance`, and -1 if the
+    cell is not cut.
     """
 
     row: Array
@@ -192,8 +193,8 @@ class CutCells:
 
     @classmethod
     def of(cls, shape: Shape, cells: Array, reference: Array, outside: Array) -> CutCells:
-        """Compute the cut cells among `cells`, (cell, 4), at rest. `outside` marks the particles
-        that lie outside the outline."""
+        """Compute which cells are cut at rest. The shape of `cells` is (cell, 4). `outside` marks
+        the particles that lie outside the outline."""
         near = np.zeros(len(reference), bool)
         near[cells[outside[cells].any(axis=1)]] = True
         candidates = np.flatnonzero(near[cells].any(axis=1))
@@ -207,8 +208,8 @@ class CutCells:
         return cls(row, distance[is_cut].astype(np.float32))
 
     def outside(self, rows: Array, middles: Array) -> Array:
-        """Return a mask, (cell, v, u), of those samples of some cut cells that lie outside the
-        outline. The samples lie at `middles` along both sides of a cell."""
+        """Return a mask of shape (cell, v, u) of those samples of some cut cells that lie outside
+        the outline. The samples lie at `middles` along both sides of a cell."""
         points = np.linspace(0.0, 1.0, self.distance.shape[1])
         hats = np.maximum(0.0, 1.0 - np.abs(middles[:, None] - points) * (len(points) - 1))
         hats = hats.astype(np.float32)
@@ -247,8 +248,8 @@ def _through_cells(cut: CutCells, corners: Array) -> Array:
 
 
 def _along_cells(shape: Shape, sides: Array) -> Array:
-    """Return those parts of the sides of the mesh boundary, (side, end, axis), that are inside the
-    outline."""
+    """Return those parts of the sides of the mesh boundary that are inside the outline, as an array
+    of shape (side, end, axis)."""
     share = np.linspace(0.0, 1.0, PARTS + 1)[:, None]
     points = sides[:, :1] * (1.0 - share) + sides[:, 1:] * share
     size = np.ptp(sides, axis=1).max(initial=0.0)
@@ -304,8 +305,8 @@ class PlottedQuantity:
         return not self.is_place and (self.component is not None or not self.vector)
 
     def values(self, part: xarray.Dataset) -> Array:
-        """Return the values, (time, owner), of a dataset that is loaded and has a time dimension.
-        Particles or bonds without a value have NaN."""
+        """Return the values of shape (time, owner) of a dataset that is loaded and has a time
+        dimension. Particles or bonds without a value have NaN."""
         variable = part[self.variable]
         values = np.asarray(variable.transpose("time", self.owner, "axis", missing_dims="ignore"))
         values = values.astype(float) if values.dtype.kind in "biu" else values
@@ -431,12 +432,12 @@ from the area of the body."""
 class ReferenceBody:
     """The data of a body that do not change in time. For each particle, `reference` (particle,
     axis) is the reference position, `site` (particle, index) are the site indices, and `number`
-    (particle,) is the particle number. `inside`, (particle,), is true for particles of the body and
-    false for frame points. `ends`, (bond, 2), are the rows of both ends of each bond.
-    `broken_step`, (bond,), is the step in which the bond broke, and -1 if it is intact. `outside`
-    marks the corners of cut cells that lie outside the outline. `shape` is the outline in lattice
-    units, and None if it is unknown or there are no such corners. `unit` is the length of a lattice
-    unit in the units of lengths."""
+    (particle,) is the particle number. `inside` of shape (particle,) is true for particles of the
+    body and false for frame points. `ends` of shape (bond, 2) are the rows of both ends of each
+    bond. `broken_step` of shape (bond,) is the step in which the bond broke, and -1 if it is
+    intact. `outside` marks the corners of cut cells that lie outside the outline. `shape` is the
+    outline in lattice units, and None if it is unknown or there are no such corners. `unit` is the
+    length of a lattice unit in the units of lengths."""
 
     reference: Array
     site: Array

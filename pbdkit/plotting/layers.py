@@ -46,11 +46,12 @@ class PixelGrid:
         return np.asarray((position - np.array([xmin, ymin])).astype(np.float32) * scale)
 
     def mean(self, corners: Array, values: Array, cut: OutlineCut | None = None) -> Array:
-        """Return the values at the pixels, (up, across), interpolated from `values` at the corners
-        of cells, (cell, 4). `corners` are the positions of the corners in pixels, (cell, 4, 2). The
-        result is NaN at pixels outside all cells and in parts of cells that are `cut` off. If cells
-        overlap, it is the mean. The distance of samples is at most the width of a pixel, so that no
-        pixel within a cell is missed."""
+        """Return an array of shape (up, across) with the values at the pixels. They are
+        interpolated from `values` at the corners of cells, of shape (cell, 4). `corners` are the
+        positions of the corners in pixels, (cell, 4, 2). The result is NaN at pixels outside all
+        cells and in parts of cells that are `cut` off. If cells overlap, it is the mean. The
+        distance of samples is at most the width of a pixel, so that no pixel within a cell is
+        missed."""
         sums, counts = np.zeros(self.across * self.up), np.zeros(self.across * self.up)
         for cells, middles in _groups(corners):
             weights = _weights(middles)
@@ -89,16 +90,16 @@ class PixelGrid:
 
 @dataclass(frozen=True)
 class OutlineCut:
-    """The parts of cells that an outline cuts off. `row`, (cell,), is the row of each cell in the
-    table of cut `cells`, and -1 if the cell is not cut."""
+    """The parts of cells that an outline cuts off. `row` of shape (cell,) is the row of each cell
+    in the table of cut `cells`, and -1 if the cell is not cut."""
 
     cells: CutCells
     row: Array
 
 
 def _within_outline(cut: OutlineCut | None, cells: Array, middles: Array) -> Array | None:
-    """Return a mask over the samples of some cells, (cell and sample,), which is false for samples
-    that the outline cuts off. Return None if no sample is cut off."""
+    """Return a mask of shape (cell and sample,) over the samples of some cells. It is false for
+    samples that the outline cuts off. Return None if no sample is cut off."""
     rows = cut.row[cells] if cut else np.empty(0, int)
     cut_cells = np.flatnonzero(rows >= 0)
     if cut is None or not len(cut_cells):
@@ -313,7 +314,7 @@ class BondValues(Layer):
 
 
 def draw_outline(ax: Axes, sides: Array) -> None:
-    """Draw segments, (side, end, axis), that do not change from step to step."""
+    """Draw segments of shape (side, end, axis) that do not change from step to step."""
     lines = LineCollection(list(sides), colors=OUTLINE_COLOUR, linewidths=0.7, zorder=2.5)
     ax.add_collection(lines, autolim=False)
 

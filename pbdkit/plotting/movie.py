@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 Show = Callable[[str, float], None]
 Frame = NDArray[np.uint8]
-"""Pixels, (row, column, colour), with the colours red, green and blue."""
+"""Pixels of shape (row, column, colour) with the colours red, green and blue."""
 FORMATS = (".mp4", ".gif")
 """File name extensions of movies."""
 WRITERS = {"imageio_ffmpeg": "imageio-ffmpeg", "PIL": "pillow"}

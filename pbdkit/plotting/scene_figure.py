@@ -115,8 +115,9 @@ class Svg:
 
 
 def extreme(motion: Motion, reference: Floats, steps: int) -> Floats:
-    """Return the largest displacement of a motion, (particle or 1, axis), at the steps at which the
-    motion changes. For a rotation, return the displacement in its first step."""
+    """Return the largest displacement of a motion at the steps at which the motion changes, as an
+    array of shape (particle or 1, axis). For a rotation, return the displacement in its first
+    step."""
     if isinstance(motion, Rotation):
         return np.atleast_2d(motion.offset(1, reference))
     if isinstance(motion, Oscillation):

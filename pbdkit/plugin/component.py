@@ -16,7 +16,7 @@ from pbdkit.errors import AnswerError, did_you_mean, printable
 from pbdkit.plugin.vector import Vector
 
 Pair = Annotated[tuple[float, float], Field(strict=False)]
-"""Type of two numbers, (x, y); a list of two in an experiment file."""
+"""Type of a pair of numbers (x, y), which is a list of two numbers in an experiment file."""
 
 
 class Strict(BaseModel):

@@ -260,7 +260,8 @@ class Moment(ABC):
     @property
     @abstractmethod
     def body(self) -> NDArray[np.bool_]:
-        """Mask of the particles of the body, (particle,); all other particles are frame points."""
+        """Mask of shape (particle,) of the particles of the body; all other particles are frame
+        points."""
 
     @property
     @abstractmethod

@@ -124,7 +124,7 @@ def build_loads(
     Returns
     -------
     Loads or None
-        None if the experiment has no loads.
+        The result is None if the experiment has no loads.
 
     Raises
     ------

@@ -50,14 +50,15 @@ def layered(outer: Floats, inner: Floats, share: Floats, facing: Floats) -> Floa
     share
         Area fraction of the inner material, (cell,).
     facing
-        Integral of n nᵀ over the border in each cell, (cell, 2, 2), where n is the normal of the
-        border.
+        Array of shape (cell, 2, 2) with the integral of n nᵀ over the border in each cell, where n
+        is the normal of the border.
 
     Returns
     -------
     NDArray
-        Stiffness, (cell, 3, 3), of a laminate with layers along the main direction of the border.
-        If the border has no main direction, it is the mean over laminates of all directions.
+        Stiffness of shape (cell, 3, 3) of a laminate with layers along the main direction of the
+        border. If the border has no main direction, it is the mean over laminates of all
+        directions.
     """
     whole = facing[:, 0, 0] + facing[:, 1, 1]
     spread = np.array([facing[:, 0, 0] - facing[:, 1, 1], 2 * facing[:, 0, 1]])
@@ -84,8 +85,8 @@ def laminate(outer: Floats, inner: Floats, share: Floats, normal: Floats) -> Flo
     Parameters
     ----------
     outer, inner
-        Stiffness of both materials, (cell, 3, 3), in the components xx, yy and xy with the
-        engineering shear strain.
+        Arrays of shape (cell, 3, 3) with the stiffness of both materials, in the components xx, yy
+        and xy with the engineering shear strain.
     share
         Area fraction of the inner material, (cell,).
     normal
@@ -136,8 +137,8 @@ def _pieces(c: Floats) -> tuple[Any, Any, Any]:
 
 
 def _to_layers(normal: Floats) -> Floats:
-    """Return the matrices, (cell, 3, 3), that rotate strains (xx, yy, engineering xy) to the axes
-    of the layers."""
+    """Return the matrices of shape (cell, 3, 3) that rotate strains (xx, yy, engineering xy) to the
+    axes of the layers."""
     c, s = normal.T
     return np.moveaxis(
         np.array(
@@ -268,7 +269,7 @@ def stiffness_at(experiment: Experiment, values: Values) -> Floats:
     Returns
     -------
     NDArray
-        Stiffness, (place, 3, 3); NaN where the material has no finite stiffness.
+        Stiffness of shape (place, 3, 3); NaN where the material has no finite stiffness.
     """
     rule, size = experiment.rule, len(next(iter(values.values())))
     parameters = {name: value for name, value in values.items() if name != STIFFNESS}

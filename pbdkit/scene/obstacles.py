@@ -688,8 +688,8 @@ def collisions(
 
 
 def _can_evade(outline: Outline, places: Floats, axis: int) -> Mask:
-    """Return a mask of the places, (axis, place), at which a particle that is led along `axis` can
-    contact_correction the outline along its other axis."""
+    """Return a mask of the places at which a particle that is led along `axis` can be moved out of
+    the outline along its other axis."""
     walls, result = Walls.of([outline]), np.zeros(places.shape[1], bool)
     with np.errstate(all="ignore"):
         for k, at in enumerate(places.T):

@@ -78,7 +78,7 @@ class Spectra:
     def spectrum(self) -> Spectrum | None:
         """Return the spectrum of the solver's step, with relaxation, momentum and frame delay.
 
-        None if the spectrum is unknown; `left_out` gives the reason.
+        It is None if the spectrum is unknown; `left_out` gives the reason.
         """
         rule_spectrum, solver = self.of_rule, self.scene.experiment.stepping
         if rule_spectrum is None:
@@ -119,7 +119,7 @@ class Spectra:
     def of_rule(self) -> Spectrum | None:
         """Return the spectrum of the rule's own step, without relaxation and momentum.
 
-        None if the frame has a delay, or if the spectrum is unknown.
+        It is None if the frame has a delay, or if the spectrum is unknown.
         """
         return self._rule_spectrum[0]
 
@@ -343,7 +343,7 @@ class Analysis:
         Returns
         -------
         bool or None
-            None if the eigenvalues of the rule are unknown, because the frame has a delay,
+            It is None if the eigenvalues of the rule are unknown, because the frame has a delay,
             neighbours are searched at every step, or the body is too large.
         """
         rule_spectrum = self.spectra.of_rule
@@ -366,8 +366,8 @@ class Analysis:
         -------
         `OscillatingMode` or None
             Period 2π / arg μ in steps, and decay per step |μ|, which is √memory if the eigenvalues
-            of the rule are real. None if no mode oscillates, or if the eigenvalues of the rule are
-            unknown.
+            of the rule are real. It is None if no mode oscillates, or if the eigenvalues of the
+            rule are unknown.
         """
         rule_spectrum = self.spectra.of_rule
         if rule_spectrum is None:
@@ -546,7 +546,8 @@ class StabilityEstimate:
     def system(self, step: int) -> LatticeSystem | None:
         """Return the equilibrium system with the roles of a step.
 
-        None if leaders do not constrain the body, or if its lattice, bonds or rule need a matrix.
+        It is None if leaders do not constrain the body, or if its lattice, bonds or rule need a
+        matrix.
         """
         roles = tuple(leading.group.leads(step) for leading in self._scene.leading)
         if roles not in self._systems:

@@ -241,7 +241,7 @@ def distance_from_equilibrium(
     Returns
     -------
     LeaderDistance or None
-        None if no leader moves at constant speed, or if the body has no equilibrium.
+        It is None if no leader moves at constant speed, or if the body has no equilibrium.
     """
     first, last, speed = fastest(scene)
     system = system_at(first) if speed else None

@@ -98,8 +98,8 @@ class Forecast:
     lag, lag_reached
         Largest distance of a follower from its equilibrium in the steps in which the leaders move
         fastest, in lattice units. `lag` is the constant distance that is reached after long motion
-        at this speed, and `lag_reached` the distance at the end of these steps. None if no leader
-        moves at constant speed.
+        at this speed, and `lag_reached` the distance at the end of these steps. Both are None if no
+        leader moves at constant speed.
     size_mm
         Extent of the body's particles along each axis in mm; None without `units`.
     warnings

@@ -90,8 +90,8 @@ class CellStresses:
 
     @cached_property
     def ratios_by_cell(self) -> Stiffness:
-        """Ratios of each cell, (kind, sublattice, cell, cell), if cells differ in stiffness. Places
-        without a cell have the ratios of the rule."""
+        """Array of shape (kind, sublattice, cell, cell) with the ratios of each cell, if cells
+        differ in stiffness. Places without a cell have the ratios of the rule."""
         rule: Any = self._scene.experiment.rule
         base: Any = material_of(rule)
         planes = {name: self._cells.weight * value for name, value in base._asdict().items()}

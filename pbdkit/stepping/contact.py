@@ -50,8 +50,8 @@ PARTICLES = 16384
 
 
 def stiffnesses(scene: Scene, place: Indices) -> Floats:
-    """Return S of particles at flat places, (particle, axis, axis), with all bonds intact; zero
-    where a particle does not move."""
+    """Return an array of shape (particle, axis, axis) with S of particles at flat places if all
+    bonds are intact. It is zero where a particle does not move."""
     each = scene.raster.kind.size // len(scene.raster.kind)
     S = np.zeros((len(place), scene.axes, scene.axes))
     for s in np.unique(place // each).tolist():
@@ -172,8 +172,8 @@ class Contact:
             flat[:, place] = flat[:, place] + self.corrections(u, place, moment)
 
     def corrections(self, u: Floats, place: Indices, moment: float) -> Floats:
-        """Return the displacements, (axis, place), that push particles at flat places out of the
-        obstacles."""
+        """Return the displacements, as an array of shape (axis, place), that push particles at flat
+        places out of the obstacles."""
         codes = self.led(math.ceil(moment))
         codes_at = np.zeros(len(place), np.int8) if codes is None else codes.ravel()[place]
         return self._corrections(
@@ -181,8 +181,8 @@ class Contact:
         )
 
     def corrections_of_masses(self, u: Floats, place: Indices, moment: float) -> Floats:
-        """Return the displacements, (axis, place), that push particles with isotropic response out
-        of the obstacles. The particles have the displacements u."""
+        """Return the displacements, as an array of shape (axis, place), that push particles with
+        isotropic response out of the obstacles. The particles have the displacements u."""
         X = self._scene.raster.reference_planes(Places(self._scene.raster.shape, place))
         at = np.stack([a + b for a, b in zip(X, u, strict=True)])
         return self._corrections(at, _alike(len(place)), np.zeros(len(place), np.int8), moment)

@@ -227,9 +227,9 @@ class NewtonForces:
         return forces
 
     def stopped(self, n: int, velocity: Floats, u: Floats, step: int) -> tuple[Floats, Floats]:
-        """Return the velocities and displacements, (axis, particle), of a group's particles after
-        obstacles have pushed them out at the end of a step. The displacement by the obstacles is
-        also added to the velocity, unless an obstacle appears in that step."""
+        """Return the velocities and displacements of shape (axis, particle) of a group's particles
+        after obstacles have pushed them out at the end of a step. The displacement by the obstacles
+        is also added to the velocity, unless an obstacle appears in that step."""
         leading = self._scene.leading[n]
         if self._contact is None or len(leading.axes) < self._scene.axes:
             return velocity, u
@@ -299,7 +299,8 @@ def prescribe(
 
 
 def _pushed(scene: Scene, state: State, forces: NewtonForces, n: int) -> tuple[Floats, Floats]:
-    """Return the velocities of a group, (axis, particle), and its displacements along its axes."""
+    """Return the velocities of a group, as an array of shape (axis, particle), and its
+    displacements along its axes."""
     leading, velocity = scene.leading[n], state.starts[n]
     motion, axes = leading.group.motion, list(leading.axes)
     assert isinstance(motion, Newton)

@@ -43,7 +43,8 @@ class NeighbourSearch:
 
     def pairs(self, m: Floats) -> tuple[Indices, Indices, Floats]:
         """Return (j, k, rest) in the configuration m: every body particle j with each of its
-        neighbours k and the rest offset, (axis, pair), sorted by j, slot and k."""
+        neighbours k, and an array of shape (axis, pair) with the rest offsets. Pairs are sorted by
+        j, slot and k."""
         from scipy.spatial import cKDTree
 
         x = self.X + m.reshape(len(m), -1)[:, self.place]

@@ -32,7 +32,8 @@ from pbdkit.scene.scene import Scene
 from pbdkit.seeds import component_generator, initial_generator
 
 BrokenSteps = NDArray[np.integer[Any]]
-"""Type of the step at which each bond broke, (plane, cell, cell); -1 for intact bonds."""
+"""Type of an array of shape (plane, cell, cell) with the step at which each bond broke; -1 for
+intact bonds."""
 
 
 def break_crossed(
@@ -62,17 +63,17 @@ Values = tuple[Array, ...]
 class State:
     """State of a run at the end of a step.
 
-    `u` is the displacement, (axis, sublattice, cell, cell), zero at places without particles.
-    `previous` is the displacement at the end of the previous step, from which momentum and PE2 are
-    computed; the next step is written into this array. `broken_step`, (plane, cell, cell), is the
-    step at which each bond broke, and -1 for intact bonds. `broken_length` is the length of the
-    bond in the intermediate configuration of that step, and 0 for intact and cut bonds. Both arrays
-    are None if no bond can break. `starts` contains an entry for each leader group: the
-    displacements at which its motion started, (axis, particle), or the velocities of a group that
-    moves by Newton's law. The entry is None if the group has not begun. `bond_values` are the state
-    variables of the fracture model for each bond, with the shape of `broken_step`.
-    `particle_values` are the state variables of the rule for each particle, (sublattice, cell,
-    cell).
+    `u` of shape (axis, sublattice, cell, cell) is the displacement; it is zero at places without
+    particles. `previous` is the displacement at the end of the previous step, from which momentum
+    and PE2 are computed; the next step is written into this array. `broken_step` of shape (plane,
+    cell, cell) is the step at which each bond broke, and -1 for intact bonds. `broken_length` is
+    the length of the bond in the intermediate configuration of that step, and 0 for intact and cut
+    bonds. Both arrays are None if no bond can break. `starts` contains an entry for each leader
+    group: the displacements at which its motion started, as an array of shape (axis, particle), or
+    the velocities of a group that moves by Newton's law. The entry is None if the group has not
+    begun. `bond_values` are the state variables of the fracture model for each bond, with the shape
+    of `broken_step`. `particle_values` are the state variables of the rule for each particle,
+    (sublattice, cell, cell).
     """
 
     step: int
@@ -164,7 +165,7 @@ def initial_state(scene: Scene) -> State:
 
 
 def _displace(scene: Scene, u: Floats) -> None:
-    """Write the displacements of body and frame, (axis, flat place), into u."""
+    """Write the displacements of body and frame into u. Their shape is (axis, flat place)."""
     raster, body = scene.raster, scene.raster.body_rows
     leads = kinds_at(raster, scene.leading, 0)[body] == LEADER
     generator = initial_generator(scene.experiment.seed)

@@ -326,8 +326,8 @@ class Operation(ABC):
         return 0
 
     def carries(self) -> Indices:
-        """Return the differences of repeat cells, (difference, axis), by which the motion of a
-        particle propagates in one step."""
+        """Return an array of shape (difference, axis) with the differences of repeat cells by which
+        the motion of a particle propagates in one step."""
         return np.zeros((0, self.scene.axes), np.intp)
 
     def next_change(self, step: int, precomputable: bool = False) -> float:

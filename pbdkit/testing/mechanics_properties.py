@@ -170,7 +170,7 @@ def _even_scene(experiment: Experiment) -> Scene | None:
     Returns
     -------
     Scene or None
-        None if other parts have preferred directions or state variables.
+        The result is None if other parts have preferred directions or state variables.
     """
     parts: Any = (experiment.rule, experiment.frame, experiment.fracture)
     if experiment.lattice.type != "square" or any(part.has_axes for part in parts):

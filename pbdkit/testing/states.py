@@ -53,7 +53,8 @@ def displacements(scene: Scene, seed: int, share: float = 0.2) -> Floats:
 
 
 def state_with(scene: Scene, u: Any) -> State:
-    """Return a state with displacements u of the body, (particle, axis), and no velocity.
+    """Return a state with the displacements u of the body and no velocity. The shape of u is
+    (particle, axis).
 
     The frame follows by its map. The step of the state is 1 and not 0, because engines may replace
     the state of step 0 by the initial state of the experiment.

@@ -220,7 +220,7 @@ def thinned(
 ) -> Thinning:
     """Select as many steps and particles as fit into `budget` bytes, with `size` bytes for each
     particle and step. First steps are omitted, until `fewest` steps remain, then particles.
-    `leaders`, (particle,), is a mask; leaders are included if their number is small."""
+    `leaders` of shape (particle,) is a mask; leaders are included if their number is small."""
     recorded, count = dataset.sizes.get("time", 1), dataset.sizes["particle"]
     affordable = max(1, budget // (size * count))
     every = math.ceil(recorded / max(affordable, min(recorded, fewest)))
@@ -443,7 +443,8 @@ def bytes_a_particle(dataset: xarray.Dataset) -> int:
 
 
 def read(variable: xarray.DataArray, steps: Rows) -> Iterator[Array]:
-    """Generate the values at each of the steps, (particle, ...), in the units of the page."""
+    """Generate, for each of the steps, an array of shape (particle, ...) with the values in the
+    units of the page."""
     factor = factor_of(variable)
     if "time" not in variable.dims:
         yield in_units(variable.values, factor)
@@ -467,8 +468,9 @@ def resting(
     """Return the content that is constant in time: names of variables, reference positions, and
     triangles.
 
-    `reference`, (particle, axis), contains the positions for zero displacement, and `spacing` is
-    the distance between neighbours in these positions. Both are in the units of the page.
+    `reference` of shape (particle, axis) contains the positions for zero displacement, and
+    `spacing` is the distance between neighbours in these positions. Both are in the units of the
+    page.
     """
     rows, role = thinning.particles, role_of(dataset)
     labels = {n: dataset[n].values for n in ("number", "i", "j") if n in dataset.variables}
@@ -963,9 +965,9 @@ def leaders_of(dataset: xarray.Dataset) -> NDArray[np.bool_]:
 
 
 def reference_of(dataset: xarray.Dataset, scene: Scene | None) -> NDArray[np.float64]:
-    """Return the positions of zero displacement, (particle, axis), in the units of the page. These
-    are the reference positions or, if they were not recorded, the positions at the first recorded
-    step."""
+    """Return an array of shape (particle, axis) with the positions of zero displacement, in the
+    units of the page. These are the reference positions or, if they were not recorded, the
+    positions at the first recorded step."""
     if "reference" in dataset.variables and dataset["reference"].ndim == 2:
         return in_units(dataset["reference"].values, factor_of(dataset["reference"]))
     if scene is not None and scene.raster.count == dataset.sizes["particle"]:
@@ -1106,7 +1108,8 @@ class SweepContent:
 
 @dataclass(frozen=True)
 class _Body:
-    """The reference positions of one member, (particle, axis), and its bonds."""
+    """The reference positions of one member, in an array of shape (particle, axis), and its
+    bonds."""
 
     reference: Array
     bonds: BondArrays | None

@@ -38,11 +38,11 @@ BROKEN = 4
 
 @dataclass(frozen=True)
 class ViewFrame:
-    """A state as it is shown: the positions of particles, (particle, 2), a value and the kind of
-    each particle, and which bonds are broken. If the values are None, particles are coloured by
-    their kinds. `kinds` and `broken` are the same objects as in the previous frame until they
-    change. `end` is the last step that was made, `picture` is the number of the picture, and
-    `step_s` the duration of a step in seconds."""
+    """A state as it is shown: the positions of particles in an array of shape (particle, 2), a
+    value and the kind of each particle, and which bonds are broken. If the values are None,
+    particles are coloured by their kinds. `kinds` and `broken` are the same objects as in the
+    previous frame until they change. `end` is the last step that was made, `picture` is the number
+    of the picture, and `step_s` the duration of a step in seconds."""
 
     step: int
     end: int

@@ -36,7 +36,7 @@ def test_the_page_counts_its_claims():
     verdicts = [row[2] for row in rows(PAGE)]
     out, fails = verdicts.count("reproduced"), verdicts.count("not reproduced")
     total, *counts = map(
-        int, re.search(r"Of (\d+) claims (\d+) .* (\d+) .* (\d+) are not", PAGE).groups()
+        int, re.search(r"counts (\d+) claims\. (\d+) .* (\d+) .* (\d+) are not", PAGE).groups()
     )
     assert (total, counts) == (len(verdicts), [out, total - out - fails, fails])
 
