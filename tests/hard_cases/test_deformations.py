@@ -174,7 +174,7 @@ def test_case_25_the_barycentre_does_not_follow_a_rotation_of_its_leaders():
         wide = np.pad(u, ((0, 0), (1, 1), (0, 0)), mode="edge")[1:-1]
         u[1:-1] = (wide[:, 2:] + wide[:, :-2] + u[2:] + u[:-2]) / 4
     found = ds.u.values[-1, body].reshape(12, 12, 2)
-    assert np.abs(found - u).max() < json.loads(ds.error_bound)["distance"] + 1e-13 < 1e-11
+    assert np.abs(found - u).max() < json.loads(ds.certificate)["distance"] + 1e-13 < 1e-11
     assert np.abs(found - turned).max() == pytest.approx(3.29, abs=0.005)
     place = ds.position.values[-1, body].reshape(12, 12, 2)
     one, other = place[1:, 1:] - place[:-1, :-1], place[:-1, 1:] - place[1:, :-1]
