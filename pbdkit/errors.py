@@ -175,7 +175,8 @@ class RetirementWarning(PbdkitWarning):
 
 
 class WarningText(str):
-    """The text of a warning, which also stores the class with which it is issued in Python."""
+    """The text of a warning. It also stores the class with which the warning is issued in
+    Python."""
 
     category: type[PbdkitWarning]
 
@@ -237,7 +238,7 @@ class AnswerError(TypeError):
 
 
 MAX_QUOTED_CHARACTERS = 400
-"""Maximum number of characters of a message that is quoted."""
+"""Maximum number of characters that are quoted from a message."""
 
 
 def one_line(text: str) -> str:

@@ -205,7 +205,7 @@ class Stop:
 
     @property
     def exit_status(self) -> int:
-        """Return 128 plus the number of the signal, which is 130 for Ctrl-C."""
+        """Return 128 plus the number of the signal. The result is 130 for Ctrl-C."""
         return 128 + (self.signal or signal.SIGINT)
 
 

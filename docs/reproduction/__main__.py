@@ -19,13 +19,12 @@ from trust import lessons
 DOCS = Path(__file__).parent.parent
 PREFACE = """# Reproduction of the paper
 
-This page compares the program with the paper that defines its model: R. dell'Erba (2018,
-[doi](https://doi.org/10.1007/s00161-018-0663-5)). Each claim of the paper that can be tested is
-quoted in a few words and has one of three verdicts: **reproduced** by the shipped case,
-**reproduced only with** a named variant, option or range, or **not reproduced**. The verdict is
-computed from the measurement below the quotation. A claim that failed was also tested with
-variants of the case: other thresholds, frame delays, shells, neighbour metrics, frames and
-particles.
+This page compares the program with the paper that defines the model of the program: R. dell'Erba
+(2018, [doi](https://doi.org/10.1007/s00161-018-0663-5)). Each testable claim of the paper is quoted
+in a few words and has one of three verdicts: **reproduced** by the shipped case, **reproduced only
+with** a named variant, option or range, or **not reproduced**. The verdict is computed from the
+measurement below the quotation. A claim that failed was also tested with variants of the case:
+other thresholds, frame delays, shells, neighbour metrics, frames and particles.
 
 The paper's time t is step t − 1: its figures at time 401 show step 400. Figure numbers are those of
 the pre-print, and particles have the paper's numbers. The paper does not give all speeds,

@@ -19,7 +19,7 @@ def pbdkit_commands() -> list[Command]:
 
 
 def _sizes(context: click.Context, option: click.Parameter, text: str | None) -> tuple[int, ...]:
-    """Return the numbers of sites in a text, in which they are separated by commas."""
+    """Return the numbers of sites in a text. The numbers are separated by commas."""
     words = [word.strip() for word in text.split(",")] if text is not None else []
     for word in words:
         if not (word.isascii() and word.isdecimal()) or not 2 <= int(word) < 2**31:

@@ -38,7 +38,7 @@ result is a dataset.
 SYSTEM = dict.fromkeys(
     (errno.EIO, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.ENAMETOOLONG), ""
 )
-"""Errors of the operating system that are not caused by a defect of pbdkit, with the remedy."""
+"""Errors of the operating system that no defect of pbdkit causes. The value is the remedy."""
 SYSTEM |= dict.fromkeys(
     (errno.EMFILE, errno.ENFILE),
     "; raise the limit (`ulimit -n`), or use fewer processes",

@@ -430,13 +430,13 @@ class StrainEnergy(Diagnostic):
 class Reaction(Diagnostic):
     """Reaction force of each leader group; 0 while the group is inactive.
 
-    The reaction is minus the sum of the forces on the particles of the group, which are exerted by
-    neighbours and loads. For a particle in two groups, half of these forces is assigned to each
-    group. If a group prescribes the motion along some axes only, its reaction is 0 along the other
-    axes. Along the prescribed axes the reaction includes the forces of obstacles on the particles
-    of the group. With the natural frame the reactions of all groups, the loads and the forces of
-    obstacles sum to zero. In other frames, frame points exert forces too. At the corners of
-    prescribed edges these forces are artefacts of the frame, and a warning is issued.
+    The reaction is minus the sum of the forces that neighbours and loads exert on the particles of
+    the group. For a particle in two groups, half of these forces is assigned to each group. If a
+    group prescribes the motion along some axes only, its reaction is 0 along the other axes. Along
+    the prescribed axes the reaction includes the forces of obstacles on the particles of the group.
+    With the natural frame the reactions of all groups, the loads and the forces of obstacles sum to
+    zero. In other frames, frame points exert forces too. At the corners of prescribed edges these
+    forces are artefacts of the frame, and a warning is issued.
     """
 
     type: Literal["reaction"] = "reaction"
@@ -569,7 +569,7 @@ class StressStrain(Diagnostic):
 
 
 MIN_SINE = 1e-6
-"""Sine of the angle below which two normals are treated as parallel.
+"""Two normals are treated as parallel if the sine of their angle is below this number.
 
 It also limits the sine below which a normal is treated as perpendicular to an axis.
 """

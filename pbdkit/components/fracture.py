@@ -231,7 +231,7 @@ StrainLimit = Annotated[float, Field(gt=0.0, le=1e75), STRESS]
 Scatter = Annotated[float, Field(ge=0.0, lt=1.0)]
 """Type of the relative scatter of strengths."""
 PERCENT = 1.0
-"""Strain from which on a warning suggests that the value was given in per cent."""
+"""For strains above this one, a warning suggests that the value was given in per cent."""
 SCATTER = "Scatter s: strengths are multiplied by random factors, uniform in 1 ± s."
 """Description of the parameter `scatter`."""
 
@@ -416,8 +416,8 @@ _DAMAGE = Remembered("damage", "damage of the bond, from 0 to 1 where it is brok
 
 
 CROSSED = 0.09
-"""Squared cosine between a bond and the normal of a crack above which the crack crosses the
-bond."""
+"""A crack crosses a bond if the squared cosine between the bond and the normal of the crack exceeds
+this number."""
 DIRECTIONS = 360
 """Number of crack directions for which the largest admissible lattice constant is computed."""
 

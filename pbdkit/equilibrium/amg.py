@@ -61,8 +61,8 @@ class _Level:
 
 
 class SparseGrids:
-    """Approximation of A⁻¹ r by one V-cycle in single precision. The matrix has `axes` unknowns for
-    each particle, which are stored next to each other. The arrays `places` and `led` of shape
+    """Approximation of A⁻¹ r by one V-cycle in single precision. For each particle the matrix has
+    `axes` unknowns, which are stored next to each other. The arrays `places` and `led` of shape
     (particle, axis of space) are the positions of the particles and of the leaders. `held` marks
     prescribed unknowns, which are not interpolated."""
 

@@ -110,7 +110,7 @@ def beside(q, half):
 
 @njit(cache=CACHED)
 def galerkin(code, stencils, coarse, halved, out):
-    """Compute out[k], the stencil of Pᵀ K P at the place of the next grid that has the code k."""
+    """Compute out[k], the stencil of Pᵀ K P at the place with the code k on the next grid."""
     a1, b1 = halved
     for n in range(1, coarse.shape[0] - 1):
         for m in range(1, coarse.shape[1] - 1):

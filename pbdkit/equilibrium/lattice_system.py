@@ -120,7 +120,7 @@ TURN = 3
 
 @dataclass(frozen=True)
 class SlowMode:
-    """Mode of the steps that decays most slowly. `planes` of shape (axis, sublattice, cell, cell)
+    """Slowest decaying mode of the steps. `planes` of shape (axis, sublattice, cell, cell)
     are its displacements, and `slowness` is 1 / (1 - λ) with its eigenvalue λ."""
 
     planes: Floats

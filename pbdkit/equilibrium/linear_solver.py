@@ -272,7 +272,7 @@ def linear_solver(
     coordinates: Coordinates | None = None,
     watch: Watch | None = None,
 ) -> LinearSolver:
-    """Return a solver for a matrix that uses the given method; `auto` selects LU up to a certain
+    """Return a solver that uses the given method for a matrix; `auto` selects LU up to a certain
     number of unknowns, and multigrid above.
 
     `coordinates` are the coordinates of the unknowns. Multigrid requires them, and LU uses them to

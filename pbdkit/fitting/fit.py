@@ -33,7 +33,7 @@ ComponentClasses = Iterable[type[Component]]
 BASE_MODEL = "as given"
 """Name of the experiment of the fit in the comparison with candidates."""
 INSET = 1e-6
-"""Distance from a bound at which the experiment must be valid.
+"""The experiment must be valid at this distance from a bound.
 
 It is a fraction of the interval between the bounds.
 """

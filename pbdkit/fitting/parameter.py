@@ -50,7 +50,7 @@ SEPARATE_PARTS = ("leaders", "loads")
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter of an experiment that is a single number.
+    """A parameter that is a single number in an experiment.
 
     Parameters
     ----------
@@ -139,7 +139,7 @@ class Parameter:
         experiment
             Experiment at which the derivative is taken.
         function
-            Function of an experiment that returns an array.
+            Function that returns an array, given an experiment.
         accuracy
             Required relative accuracy.
 

@@ -326,7 +326,8 @@ IDENTIFIABLE_RATIO = 0.25
 It is divided by the interval between the bounds.
 """
 MIN_COMPONENT = 0.3
-"""Component of a direction above which a parameter is considered a part of the direction."""
+"""A parameter is considered a part of a direction if its component in the direction exceeds this
+number."""
 AT_BOUND = 1e-6
 """Distance from a bound up to which a value is at the bound, relative to the interval."""
 MAX_ITERATIONS = 30

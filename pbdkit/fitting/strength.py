@@ -477,7 +477,7 @@ The likelihood is then smaller by a factor of about 2e-8.
 DRAWS = 20_000
 """Number of samples of the parameters."""
 NEGLIGIBLE_DEPTH = 1e-8
-"""Fraction of the strain of the weakest specimen that is negligible."""
+"""Negligible strain, as a fraction of the strain of the weakest specimen."""
 LawBounds = tuple[tuple[float, float], tuple[float, float]]
 """Bounds of both parameters of a law."""
 

@@ -111,8 +111,7 @@ class Checkpoint:
     def parts(
         self, like: Mapping[str, Any], steps: int, classes: Mapping[str, type]
     ) -> dict[str, Any]:
-        """Return the parts of the driver's state, together with the recorded steps, which have the
-        key ``seen``.
+        """Return the parts of the driver's state, and the recorded steps under the key ``seen``.
 
         `like` is the state of the driver before its first step, `steps` the number of steps of the
         run, and `classes` are further dataclasses that the checkpoint may contain. Raises

@@ -37,11 +37,11 @@ FIRST_LENGTH = 1024
 """Initial length of a growing dimension."""
 
 Waiting = dict[str, list[Array]]
-"""Buffered entries of each column, which do not yet fill a chunk."""
+"""For each column, the buffered entries, which do not yet fill a chunk."""
 
 
 class NetcdfFile:
-    """File with the columns of a dataset, which are written while a run continues. Its state
+    """File to which the columns of a dataset are written while a run continues. Its state
     consists of the buffered entries (`waiting`) and of the number of entries of each column that
     are in the file (`written`)."""
 

@@ -41,7 +41,7 @@ are multiplied."""
 
 
 class RecordedVariables:
-    """The state variables and diagnostics of a scene that are recorded in its dataset."""
+    """The recorded state variables and diagnostics of a scene."""
 
     def __init__(self, scene: Scene) -> None:
         experiment = scene.experiment

@@ -135,7 +135,7 @@ VERSION = (2, 2)
 TYPE = b"UnstructuredGrid"
 """Type of the grid."""
 BLOCK_BYTES = 2**25
-"""Approximate number of bytes of a variable that are in memory at the same time."""
+"""Approximate number of bytes that are in memory at the same time, for one variable."""
 CHUNK = 2**16
 """Number of values in a chunk of a growing array."""
 ELSEWHERE = ("position", "time", "particle", "site", "axis", "bond_ends", "broken_step")

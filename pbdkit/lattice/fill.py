@@ -336,7 +336,7 @@ omitted in the corners of wide voids, and are as negligible as cells below `MIN_
 INWARD = 1e-3
 """Fraction by which points on the border of a cell are moved towards its centre."""
 NEAR_END = 1 / 64
-"""Fraction of the length of a segment that is not searched for a void at each of its ends."""
+"""At each end of a segment, this fraction of its length is not searched for a void."""
 TIE_RTOL = 1e-9
 """Relative difference up to which the areas of two groups of cells count as equal."""
 

@@ -346,8 +346,8 @@ class BondTable:
 
 
 def plane_block(raster: Raster, plane: BondPlane, *, inside: bool = False) -> Block | None:
-    """Return the block of the places at which the bonds of a plane start that have at least one end
-    in the body.
+    """Return the block of places at which bonds of a plane start. Bonds without an end in the body
+    are excluded.
 
     With `inside`, only bonds with both ends in the body are included.
     """

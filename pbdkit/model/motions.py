@@ -33,7 +33,8 @@ MAX_LINE = 2**16
 
 
 def names_or_file(*names: str) -> Callable[[dict[str, Any]], None]:
-    """Return an update of a JSON Schema that requires either the fields `names` or `file`."""
+    """Return an update of a JSON Schema. With the update, the schema requires either the fields
+    `names` or `file`."""
 
     def either(schema: dict[str, Any]) -> None:
         schema["required"] = [name for name in schema.get("required", ()) if name not in names]

@@ -112,7 +112,8 @@ class Division:
         return self.local_part(whole), False
 
     def local_part(self, whole: State | None) -> State:
-        """Return this process's part of a whole state, which only the first process has."""
+        """Return this process's part of a whole state. Only the first process has the whole
+        state."""
         members = self.ranks.allgather(self.halo.members)
         if whole is None or not self.ranks.is_root:
             return self._state(None)
@@ -137,8 +138,8 @@ class Division:
         return own | {"state": self.halo.joined(own["state"])}
 
     def scattered(self, parts: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the dictionary with the state of the driver of this part, given that of the whole
-        lattice, which only the first process has."""
+        """Return the dictionary with the state of the driver of this part. `parts` is the
+        dictionary of the whole lattice in the first process, and is not used in the others."""
         rest = self.ranks.bcast({key: part for key, part in parts.items() if key != "state"})
         state = self.local_part(parts.get("state") if self.ranks.is_root else None)
         return {**rest, "state": state}

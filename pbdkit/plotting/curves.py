@@ -161,7 +161,7 @@ MAX_LEGEND_LINES = 12
 MAX_INNER_LEGEND_LINES = 4
 """Maximum number of lines for which the legend is inside the panel."""
 FEW_POINTS = 40
-"""Maximum number of points of a line that is drawn with markers."""
+"""A line is drawn with markers if it has at most this number of points."""
 BROAD = 44
 """Characters per line of a label below the panel."""
 TALL = 34

@@ -683,8 +683,8 @@ class Extent:
 
 
 def extent_of(recording: Trajectory, snapshots: Iterable[Snapshot], look: PlotOptions) -> Extent:
-    """Compute the extent of steps of a recording, which are processed one after the other. Raises
-    ExperimentError if no particle has a position."""
+    """Compute the extent of steps of a recording. The steps are processed one after the other.
+    Raises ExperimentError if no particle has a position."""
     body, quantity = recording.body, recording.quantity
     reference = body.reference if look.outline else np.empty((0, 2))
     low, high = [reference.min(axis=0, initial=np.inf)], [reference.max(axis=0, initial=-np.inf)]

@@ -172,7 +172,7 @@ OBSTACLE_ARROW_COLOUR = "#404040"
 REGION_COLOURS = ("#E69F00", "#56B4E9", "#CC79A7", "#009E73", "#F0E442", "#0072B2")
 """Colours of the regions of a body."""
 MAX_PARTICLES = 3000
-"""Maximum number of particles of a body for which all particles are drawn."""
+"""Maximum number of particles up to which all particles of a body are drawn."""
 MAX_REGION_DOTS = 1500
 """Maximum number of dots that are drawn in a region."""
 MAX_ARROWS = 5

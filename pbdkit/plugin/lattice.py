@@ -391,7 +391,8 @@ class NeighbourMetric(Component):
 
 @dataclass(frozen=True)
 class CellPolygon:
-    """A cell: a polygon of sites on a circle that contains no other site (Delaunay).
+    """A cell: a polygon of sites. The sites lie on a circle, and the circle contains no other site
+    (Delaunay).
 
     Cells are squares on the square lattice and triangles on the hexagonal one.
 
@@ -486,7 +487,8 @@ class Tiling:
         return kinds.pop() if self.beside and len(kinds) == 1 else None
 
     def is_diagonal(self, slot: Slot) -> bool:
-        """Return whether a slot is a diagonal of a cell, which is then on both sides of the bond.
+        """Return whether a slot is a diagonal of a cell. If so, the cell is on both sides of the
+        bond.
 
         Parameters
         ----------
@@ -503,7 +505,7 @@ class Tiling:
 
 
 def signed_area(corners: Sequence[Any]) -> Any:
-    """Return the area of a polygon, which is negative if its corners are clockwise, elementwise."""
+    """Return the area of a polygon, elementwise. It is negative if the corners are clockwise."""
     pairs = [(corners[k - 1], corners[k]) for k in range(len(corners))]
     return sum(a.x * b.y - b.x * a.y for a, b in pairs) / 2
 

@@ -31,10 +31,10 @@ if TYPE_CHECKING:
 MAX_EQUILIBRIA = 1000
 """Number of recorded equilibria above which a warning suggests recording fewer."""
 MIN_FLATNESS = 0.05
-"""Flatness of a cell below which a warning is issued."""
+"""A warning is issued for a cell with a flatness below this number."""
 MAX_DISTANCE = 2.0
-"""Distance, in lattice spacings, of a selected point from the body above which a warning is
-issued."""
+"""A warning is issued if the distance of a selected point from the body exceeds this number of
+lattice spacings."""
 MAX_LISTED = 5
 """Maximum number of distant points listed in warnings."""
 ROUND_ANGLE = math.pi / 12

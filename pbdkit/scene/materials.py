@@ -124,7 +124,7 @@ def laminate(outer: Floats, inner: Floats, share: Floats, normal: Floats) -> Flo
 
 
 def _pieces(c: Floats) -> tuple[Any, Any, Any]:
-    """Return the terms of a material of which the mean over the layers is computed. They are given
+    """Return those terms of a material that are averaged over the layers. They are given
     in the axes of the layers.
 
     The terms are C_nn⁻¹, C_nn⁻¹ C_nt and C_tt - C_tn C_nn⁻¹ C_nt. The index n stands for the

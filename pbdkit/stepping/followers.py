@@ -307,8 +307,8 @@ class MoveFollowers(Operation):
         return self.scene.loads.changes(steps) if self.scene.loads else []
 
     def breakpoints(self, steps: int) -> list[int]:
-        """Return the moments at which the slope of a time-dependent parameter, or of a load that
-        acts, changes."""
+        """Return the moments at which the slope changes of a time-dependent parameter or of a load
+        that acts."""
         time_dependent = self.scene.experiment.time_dependent.values()
         spans = [(number, 0, steps) for number in time_dependent]
         for loading in self.scene.loads.each if self.scene.loads else ():

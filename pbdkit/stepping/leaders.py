@@ -351,8 +351,8 @@ def place(u: Floats, leaders: Leaders) -> None:
 
 
 def placed(u: Floats, leaders: Leaders) -> Leaders:
-    """Return the leaders at the same places and along the same axes, with the displacements that u
-    has there."""
+    """Return the leaders at the same places and along the same axes, with the displacements of u at
+    these places."""
     flat = u.reshape(len(u), -1)
     return [Placed(at, np.array([flat[a, at] for a in axes]), axes) for at, _, axes in leaders]
 

@@ -134,8 +134,8 @@ class Evaluator:
         return d if to.broken is None else where(to.broken, lost, d)
 
     def damage(self, r: Vector, c: Any) -> tuple[Any, Any]:
-        """Return the fractions of the force of an intact bond with the constants c that are lost in
-        the cells to its left and right."""
+        """Return the lost fractions of the force of an intact bond with the constants c, in the
+        cells to its left and to its right."""
         model: Any = self._model
         if isinstance(model, SoftensCells):
             return c.damage_left, c.damage_right

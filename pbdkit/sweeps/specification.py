@@ -104,7 +104,7 @@ Times = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False, m
 
 
 class Keep(Strict):
-    """Selection of the variables and steps of each run that the dataset contains.
+    """Selection of those variables and steps of each run that the dataset contains.
 
     `variables` are names of variables, by default all. `times` are `all` recorded steps, the `last`
     step, or a list of steps, which are then recorded.

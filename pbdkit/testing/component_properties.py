@@ -699,7 +699,7 @@ def _apart(value: Any, expected: Any) -> tuple[int, ...] | None:
 
 
 CLOSE = 1e-9
-"""Distance from the breaking strain at which a bond is tested, relative to its length."""
+"""A bond is tested at this distance from its breaking strain, relative to its length."""
 
 
 @property_of(FractureModel, is_needed=True)

@@ -93,7 +93,7 @@ def numbers_of(part: Component, scene: Scene) -> tuple[Remembered, ...]:
 def owners(part: Component, scene: Scene) -> Bonds | Particles:
     """Return the bonds or particles that have the state variables of a component.
 
-    They are in the form in which `draw` receives them.
+    The form is that in which `draw` receives them.
     """
     return (describe_particles if isinstance(part, FollowerRule) else describe_bonds)(scene)
 

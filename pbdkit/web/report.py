@@ -167,7 +167,7 @@ def _against(dataset: xarray.Dataset, y: str, x: str, points: int) -> Curve:
 
 Rows = NDArray[np.intp]
 MIN_STEPS = 60
-"""Minimum number of steps of a run that are shown, if at least that number is recorded."""
+"""Minimum number of shown steps of a run, if at least that number is recorded."""
 MAX_PARTICLES = 50_000
 """Maximum number of particles that a browser can draw smoothly in motion, with their bonds."""
 MAX_SHOWN_LEADERS = 200
@@ -594,7 +594,7 @@ def _triangles(reference: Array, sites: list[Array], body: NDArray[np.bool_]) ->
 
 KeyPath = tuple[str | int, ...]
 MAX_TRIED = 150
-"""Maximum number of keys of an experiment for which it is tested whether they can be omitted."""
+"""Up to this number of keys of an experiment, it is tested which of them can be omitted."""
 PARTS = ("lattice", "body", "neighbours", "rule", "frame", "fracture", "solver")
 """Parts of an experiment that the summary describes."""
 

@@ -456,8 +456,8 @@ def _with_key(parts: Parts, key: str, values: list[Any]) -> Parts:
 
 
 MAX_INLINE_KNOTS = 500
-"""Maximum number of knots of a path that is written in the experiment. Longer paths are written to
-a table."""
+"""A path is written in the experiment if it has at most this number of knots. Longer paths are
+written to a table."""
 COMMENT = "# Written by pbdkit live: `pbdkit run` repeats the session bit for bit.\n"
 """First line of a saved session."""
 

@@ -54,8 +54,8 @@ class ViewFrame:
     broken: Bytes
 
     def encoded(self, previous: ViewFrame | None) -> bytes:
-        """Encode the frame for a viewer. Parts that are the same as in the previous frame, which
-        the viewer has, are omitted."""
+        """Encode the frame for a viewer. The viewer has the previous frame. Parts that are the same
+        in both frames are omitted."""
         parts: list[NDArray[Any]] = [self.positions]
         holds = 0
         for bit, part, previous_part in (

@@ -71,7 +71,7 @@ class TileWriter(PlanWriter):
             self._move_on()
 
     def sweep(self, level: int) -> None:
-        """Write a call for the part of the range that motion has reached. For an inner rule the
+        """Write a call for the part of the range that motion has reached. For an inner rule, the
         range is ahead of the particles that move."""
         out, first = self.out, 2 * self.plan.scene.axes - 2
         self._keep_to_moving()
