@@ -87,7 +87,7 @@ class SerialCommunicator(Communicator):
         return numbers
 
     def processes_on_machine(self) -> int:
-        """Return 1, for this process."""
+        """Return 1, because there is only one process."""
         return 1
 
 

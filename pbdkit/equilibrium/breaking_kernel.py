@@ -567,7 +567,7 @@ class BreakingKernel:
         return became == CONVERGED, changes
 
     def _take_roles(self, step: int, state: State) -> None:
-        """Prepare the arrays for the roles of a step, if they have changed."""
+        """Prepare the arrays for the roles of a step, if the roles have changed."""
         roles = tuple(leading.group.leads(step) for leading in self._scene.leading)
         if self._of_roles and roles == self._roles:
             return

@@ -363,7 +363,7 @@ class LatticeSystem(System):
         return compliance(self._grids)
 
     def _pull(self, moves: Floats) -> Floats:
-        """Return K c for a correction c with these moves, as a field."""
+        """Return K c, as a field, for a correction c with the given moves."""
         out, scale = self._grids.grid().field(np.float64), self._matrix.scale
         same = tuple(scale[0].tolist())
         kernels().scaled(self._solver.matrix, same, scale, field_of(self._matrix, moves), out)

@@ -354,8 +354,8 @@ def _dissect(places: Floats, members: Indices, reach: Floats, order: list[Indice
 def _halves(
     places: Floats, members: Indices, reach: Floats
 ) -> tuple[Indices, Indices, Indices] | None:
-    """Return the members on either side of a strip across the longer side of the part, and the
-    members in the strip. Return None if there is no member on one of the sides."""
+    """Divide the members of a part by a strip across its longer side. Return the members on both
+    sides of the strip and in the strip. Return None if there is no member on one of the sides."""
     positions = places[members]
     sides = np.ptp(positions, axis=0)
     axis = int(sides[1] / reach[1] > sides[0] / reach[0])

@@ -186,7 +186,7 @@ class RestSystem:
         return cls(finder.scene, leads, bonds, methods)
 
     def serves(self, other: RestSystem) -> bool:
-        """Return whether these data and `other` determine the same system."""
+        """Return whether `self` and `other` determine the same system."""
         same = self.scene is other.scene and (self.leads, self.methods) == (
             other.leads,
             other.methods,

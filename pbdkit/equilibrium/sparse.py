@@ -105,7 +105,7 @@ class Subsystem(ABC):
 
     @property
     def name(self) -> str:
-        """Name of the method."""
+        """Name of the method of the linear solver."""
         return self._solver.name if self._solver else "lu"
 
     @property
@@ -607,7 +607,7 @@ class MatrixSystem(System):
         return SingularSubsystem(matrix, back, self._watch)
 
     def _is_fixed(self, axes: list[int], members: Indices) -> bool:
-        """Return whether leaders and prescribed components adjacent to these unknowns suppress all
+        """Return whether leaders and prescribed components adjacent to some unknowns suppress all
         rigid motions: translation along each axis and, with two axes, rotation."""
         leader_entries = self._operator.couplings_leader.entries(axes)
         is_adjacent = np.isin(leader_entries.rows, members) & (leader_entries.values != 0.0)
@@ -624,8 +624,8 @@ class MatrixSystem(System):
         return bool(np.linalg.matrix_rank(motions) == motions.shape[1])
 
     def _coordinates(self, axes: list[int], members: Indices) -> Coordinates:
-        """Return the coordinates of these unknowns. If the unknowns belong to one axis, particles
-        with a prescribed component along this axis are listed with the leaders."""
+        """Return the coordinates of the given unknowns. If the unknowns belong to one axis,
+        particles with a prescribed component along this axis are listed with the leaders."""
         where, is_guided = members[:: len(axes)] // len(axes), self._guided[:, axes]
         positions = self._X[is_guided[:, 0]] if len(axes) == 1 else self._X[:0]
         guided = is_guided[where].ravel() if len(axes) > 1 and is_guided.any() else None

@@ -125,15 +125,16 @@ class PrimitiveRaster:
         return len(self.scene.raster.cell.sites) == 1
 
     def places(self, place: Indices) -> Indices:
-        """Convert flat places of particles on the scene's raster to flat places on this one."""
+        """Convert flat places of particles on the scene's raster to flat places on the raster of
+        the stencils."""
         if self.is_the_scenes:
             return place
         places: Indices = np.ravel_multi_index(tuple(self.index(place).T), self.shape)
         return places
 
     def index(self, place: Indices) -> Indices:
-        """Convert flat places of particles on the scene's raster to places (row, place) on this
-        one."""
+        """Convert flat places of particles on the scene's raster to places (row, place) on the
+        raster of the stencils."""
         if self.is_the_scenes:
             return np.stack(np.unravel_index(place, self.shape), axis=-1)
         raster = self.scene.raster

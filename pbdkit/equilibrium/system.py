@@ -229,7 +229,7 @@ class Rows:
         return np.random.default_rng(0).uniform(-1.0, 1.0, shape)
 
     def whole(self, numbers: Array) -> Array:
-        """Gather numbers, (..., row), of the rows of each process, and return the numbers of all
+        """Gather an array of shape (..., row) from each process, and return the array for all
         rows."""
         return numbers
 

@@ -348,7 +348,7 @@ class LongWaves:
     gradients: tuple[Gradient, ...]
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the numbers by the names of ``pbdkit identify --json``."""
+        """Return the values under the names that ``pbdkit identify --json`` uses."""
         numbers = {"second_order": self.second, "diffusivity_tensor": self.diffusivity}
         waves = {"fast": vars(self.fast), "slow": vars(self.slow)}
         return numbers | waves | {"gradients": [vars(gradient) for gradient in self.gradients]}

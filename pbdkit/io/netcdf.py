@@ -152,7 +152,7 @@ class NetcdfFile:
             variable.attrs[LABELS] = " ".join(labels)
 
     def _labels(self, dims: set[str]) -> list[str]:
-        """Return the coordinates along these dimensions with a name other than that of a
+        """Return those coordinates along the given dimensions of which the name is not that of a
         dimension."""
         of_others = (c for c in self._columns.values() if c.coordinate and c.dims != (c.name,))
         return [column.name for column in of_others if dims.issuperset(column.dims)]

@@ -286,7 +286,7 @@ class Recorder:
 
     @np.errstate(all="ignore")
     def observe(self, state: State, *, last: bool = False, time: float | None = None) -> None:
-        """Record the variables that are due at this step.
+        """Record the variables that are due at the step of the state.
 
         A step that was observed before is skipped. The `last` step of a run that stops early,
         however, is recorded in any case. `time` is the time of an equilibrium within a step. Raises

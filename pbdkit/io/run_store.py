@@ -143,7 +143,7 @@ class RunStore:
         return [key for key in self._listed if key.startswith(begin)]
 
     def piece(self, key: str) -> bytes:
-        """Return the piece with a key in the last commit."""
+        """Return the piece that the last commit has under a key."""
         with self._sqlite():
             query = "SELECT data, digest FROM pieces WHERE key = ?"
             row = self._file.execute(query, (key,)).fetchone()
@@ -164,7 +164,7 @@ class RunStore:
             self.piece(key)
 
     def facts(self, key: str) -> Any:
-        """Return the facts, stored as JSON, with a key in the last commit."""
+        """Return the facts that the last commit has under a key. They are stored as JSON."""
         try:
             return json.loads(self.piece(key))
         except (ValueError, RecursionError):

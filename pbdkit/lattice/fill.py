@@ -84,7 +84,7 @@ class Filling:
         return OmittedCells.of(self.left_out[(line >= low) & (line < high)])
 
     def within(self, low: Index, high: Index) -> Filling:
-        """Return the part of the filling from site `low` to `high`, which is excluded."""
+        """Return the part of the filling from site `low` to site `high`; `high` is excluded."""
         ends = (
             [n - first for n, first in zip(end, self.first, strict=True)] for end in (low, high)
         )

@@ -331,8 +331,8 @@ class Raster:
         return (lines >= low) & (lines < high)
 
     def sees_frame(self, lines: Indices) -> Mask:
-        """Return a mask of the lines with those frame points that this process assigns to the body
-        particles they follow."""
+        """Return a mask of lines. For the frame points on these lines, this process determines the
+        body particles that they follow."""
         low, high = self.row_range.framed if self.row_range else (-NOWHERE, NOWHERE)
         return (lines >= low) & (lines < high)
 
@@ -542,8 +542,8 @@ class Restriction:
     moving: tuple[int, int]
 
     def is_between(self, place: Indices, rows: tuple[int, int]) -> Mask:
-        """Return a mask that is true for those flat places of the whole raster that lie in these
-        rows."""
+        """Return a mask that is true for those flat places of the whole raster that lie in the
+        given rows."""
         row = np.unravel_index(place, self.whole.shape)[1]
         return np.asarray((row >= rows[0]) & (row < rows[1]))
 
@@ -568,7 +568,7 @@ class Restriction:
         return rows - self.part.particle_offset + self.whole.particle_offset
 
     def cut(self, planes: Array) -> Array:
-        """Return a copy of the part of an array that belongs to these rows. The last axes of the
+        """Return a copy of those rows of an array that belong to the part. The last axes of the
         array are the axes of the raster's cells."""
         axes = len(self.whole.shape) - 1
         return row_view(planes, axes, slice(self.low, self.low + self.part.shape[1])).copy()

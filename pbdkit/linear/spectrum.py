@@ -87,8 +87,8 @@ def modes(eigenvalues: Complex, relaxation: float, memory: float) -> Complex:
 
 
 def largest_stable_relaxation(eigenvalues: Complex, memory: float) -> float | None:
-    """Return the relaxation below which all modes decay with this momentum. Modes with λ = 1 are
-    ignored.
+    """Return the relaxation below which all modes decay with the given momentum. Modes with λ = 1
+    are ignored.
 
     Return None if no positive relaxation is stable, because an eigenvalue exceeds 1 or |memory| ≥
     1. Also return None if every relaxation is stable.
@@ -174,7 +174,7 @@ def spectrum(matrix: Any) -> Spectrum:
 
 
 def spectrum_of(eigenvalues: Complex, symmetric: bool) -> Spectrum:
-    """Return the spectrum with these eigenvalues."""
+    """Return the spectrum with the given eigenvalues."""
     if not len(eigenvalues):
         return Spectrum(0.0, 0.0, 0.0, True, eigenvalues)
     real = eigenvalues.real

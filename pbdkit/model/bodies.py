@@ -321,7 +321,8 @@ class Difference(Composed):
         return self.of[0].boxes()
 
     def distance(self, sites: Sites) -> Floats:
-        """Return the maximum of the first distance and the negative distances of the others."""
+        """Return the maximum of the distance from the first part and the negative distances from
+        all other parts."""
         first, *rest = (part.distance(sites) for part in self.of)
         return reduce(np.maximum, (-other for other in rest), first)
 

@@ -371,7 +371,7 @@ class Newton(Motion):
         return np.asarray(velocity + force / self.mass)
 
     def lightest(self, stiffness: float) -> float:
-        """Return the mass below which a particle on a spring of this stiffness is unstable.
+        """Return the mass below which a particle on a spring of the given stiffness is unstable.
 
         With the stiffness k, the mass m and the damping c, steps are stable for k ≤ 4 m - 2 c.
         Without damping this is ω ≤ 2.

@@ -179,7 +179,7 @@ class Stepping(Solver):
 
     @property
     def stepping(self) -> Stepping:
-        """The settings of this solver themselves."""
+        """This solver itself, because it has these settings."""
         return self
 
     @property
@@ -229,7 +229,7 @@ class Stepping(Solver):
         return _number(self.memory_setting, "memory")
 
     def with_weights(self, relaxation: float, memory: float) -> Stepping:
-        """Return the settings with these values of relaxation and momentum."""
+        """Return the settings with the given values of relaxation and momentum."""
         values = {"relaxation_setting": relaxation, "memory_setting": memory}
         return self.model_copy(update=values)
 
@@ -260,7 +260,7 @@ class Equilibrium(Solver):
 
     @property
     def equilibrium(self) -> Equilibrium:
-        """The settings of this solver themselves."""
+        """This solver itself, because it has these settings."""
         return self
 
 

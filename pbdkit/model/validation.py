@@ -69,7 +69,7 @@ def read_field(value: dict[str, Any], files: FileResolver) -> Gridded:
 
 @lru_cache(maxsize=4)
 def _read(path: Path, variable: str, size: int, changed_ns: int) -> Gridded:
-    """Read a file with this size and modification time.
+    """Read a file, given its size and its time of modification.
 
     The result is cached for members of a sweep.
     """

@@ -154,8 +154,8 @@ def _built(experiment: Experiment, ranks: Communicator) -> Scene:
 
 
 def _levels(rule: FollowerRule) -> int:
-    """Return an upper bound of the number of times that a step evaluates neighbours, one after the
-    other. The evaluation of the forces on masses is included."""
+    """Return an upper bound of the number of successive evaluations of neighbours in a step. The
+    evaluation of the forces on masses is included."""
     levels = 2
     while isinstance(rule, AppliesTwice):
         with errors_attributed_to(rule, "to return its inner rule", "rule"):
@@ -365,8 +365,8 @@ class DistributedSimulation(Simulation):
         self.warnings, self.prediction = self._warnings(scene, bound), prediction(scene, bound)
 
     def _warnings(self, scene: Scene, bound: Bound | None) -> tuple[str, ...]:
-        """Return the warnings about the part. Warnings about masses refer to the whole scene and
-        are issued by the first process."""
+        """Return the warnings about the part of the scene in this process. Warnings about masses
+        refer to the whole scene and are issued by the first process."""
         if not any(leading.share is not None for leading in scene.leading):
             return quick_warnings(scene, bound)
         with self.division.ranks.raise_together():
@@ -383,8 +383,8 @@ class DistributedSimulation(Simulation):
         return self.division.count
 
     def recorder(self, sink: Sink) -> Recorder:
-        """Return the recorder of the part. It writes to a sink that was returned by the method
-        `sink`."""
+        """Return the recorder of the part of the scene in this process. It writes to a sink that
+        was returned by the method `sink`."""
         assert isinstance(sink, PartSink)
         return DistributedRecorder(self.division, sink)
 

@@ -145,7 +145,8 @@ class Division:
         return {**rest, "state": state}
 
     def stepper(self, choice: Choice) -> tuple[Engine, Choice]:
-        """Return the engine of the part. By default it uses one thread in each process."""
+        """Return the engine for the part of the scene in this process. By default it uses one
+        thread in each process."""
         if self.scene.experiment.stepping.threads == "auto":
             choice = replace(choice, threads=1)
         with self.ranks.raise_together():
@@ -284,12 +285,13 @@ class DistributedRows(Rows):
         self._halo.meet(field)
 
     def whole(self, numbers: NDArray[Any]) -> NDArray[Any]:
-        """Gather the numbers of all rows, (..., row)."""
+        """Gather an array of shape (..., row) from each process, and return the array for all
+        rows."""
         return np.concatenate(self.communicator.allgather(numbers[..., self.own]), axis=-1)
 
     def random(self, shape: tuple[int, ...]) -> Floats:
-        """Return the random numbers that a single process would draw for these rows. The generator
-        is advanced by one for each number of the other rows."""
+        """Return the random numbers that a single process would draw for the rows of this process.
+        The generator is advanced by one for each number of the other rows."""
         assert self.strip
         planes, (rows, places) = shape[:-2], shape[-2:]
         numbers: Floats = np.empty((math.prod(planes), rows, places))

@@ -123,7 +123,7 @@ class Subdomain:
 
     @property
     def own(self) -> slice:
-        """Range of the own rows in arrays of the part."""
+        """Range of the rows that the process owns, in arrays of its part."""
         return slice(self.begin - self.low, self.end - self.low)
 
     def after(self, rows: int) -> Subdomain:
@@ -430,8 +430,8 @@ def _touch(part: Subdomain, other: Subdomain) -> bool:
 def part_of_state(
     whole: State, axes: int, subdomain: Subdomain, members: Sequence[Indices]
 ) -> State:
-    """Return a copy of the part of a whole state in a subdomain. `members` are the members of the
-    leader groups that it contains."""
+    """Return a copy of that part of a whole state that lies in a subdomain. `members` are the
+    members of the leader groups that it contains."""
     starts = zip(whole.starts, members, strict=True)
     starts_of_part = tuple(
         None if start is None else np.asarray(start)[:, rows] for start, rows in starts

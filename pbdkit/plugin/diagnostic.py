@@ -284,7 +284,7 @@ class Moment(ABC):
 
     @abstractmethod
     def rows(self, numbers: tuple[int, ...]) -> NDArray[np.intp]:
-        """Return the rows of the particles with these numbers.
+        """Return the rows of the particles with the given numbers.
 
         Parameters
         ----------

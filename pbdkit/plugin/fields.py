@@ -309,7 +309,8 @@ class Drawn(Strict):
         return self._grid
 
     def matches(self, parameters: Mapping[str, float], x: Floats, y: Floats) -> bool:
-        """Return whether the values were generated with these parameters on these coordinates."""
+        """Return whether the values were generated with the given parameters on the given
+        coordinates."""
         if any(getattr(self, name) != number for name, number in parameters.items()):
             return False
         pairs = (self._grid.x, x), (self._grid.y, y)

@@ -47,8 +47,8 @@ class Frame:
             plane[self.place] = np.bincount(self.map.point, values, len(self.place))
 
     def restrict(self, to: Restriction) -> Frame | None:
-        """Return the frame restricted to those points of some rows that follow only particles of
-        these rows. Return None if there are no such points."""
+        """Return the frame restricted to given rows. A point is retained if it follows only
+        particles of these rows. Return None if no point is retained."""
         missing = self.map.point[~to.is_present(self.body_place)]
         has_missing = np.bincount(missing, minlength=len(self.place)) > 0
         is_resolved = to.is_moving(self.place) & ~has_missing

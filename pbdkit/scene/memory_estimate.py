@@ -154,7 +154,7 @@ class Sizes:
 def sizes_of(
     experiment: Experiment, neighbourhood: Neighbourhood, particles: int, *, grids: bool = True
 ) -> Sizes:
-    """Return the estimated sizes of a scene with this number of particles. `grids` is false if
+    """Return the estimated sizes of a scene with a given number of particles. `grids` is false if
     multigrid is known to be impossible for its lattice or leaders."""
     planes = len(neighbourhood.planes) / len(neighbourhood.slots)
     value = 8 if experiment.stepping.precision == "float64" else 4
@@ -262,8 +262,8 @@ def refuse_too_large(
 
 
 def _bytes_of(dtype: str, value: int) -> int:
-    """Return the number of bytes of a value with this data type. Floating-point values are stored
-    with `value` bytes."""
+    """Return the number of bytes of a value with the given data type. Floating-point values are
+    stored with `value` bytes."""
     return value if dtype == "f8" else np.dtype(dtype).itemsize
 
 

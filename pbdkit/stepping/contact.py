@@ -265,7 +265,7 @@ class Contact:
         return [block for block in blocks if block]
 
     def _near(self, block: Block, u: Floats, box: Floats) -> Block | None:
-        """Return the part of a block that contains all particles that may lie in the box; `u` are
+        """Return the part of a block that contains all particles that may lie in a box; `u` are
         the displacements of the block."""
         raster = self._scene.raster
         low, high = np.array([[np.fmin.reduce(p, axis=None) for p in u],

@@ -157,7 +157,7 @@ def _aliases(plan: Plan, level: Level) -> list[str]:
 
 
 def _cells(plan: Plan) -> list[str]:
-    """Return lines for the cell indices of place j, the last one as `j + j0`."""
+    """Return lines for the cell indices of place j. The last index is `j + j0`."""
     lines, index = ["j0 = j % extent[-1] - j"], "j // extent[-1]"
     for axis, name in reversed(list(enumerate(plan.lead, 1))):
         lines.append(f"{name} = {index} % extent[{axis}]")
@@ -371,7 +371,7 @@ def make_kernel(source: str, functions: Mapping[str, DeviceFunction], threads: i
 
 
 def text_of(run: Any, arguments: tuple[Any, ...], device: tuple[int, int]) -> str:
-    """Return the text of the kernel (PTX) for arguments of these types, on devices with a given
+    """Return the text of the kernel (PTX) for arguments of the given types, on devices with a given
     compute capability.
 
     Raises PbdkitError if products and sums could be contracted.

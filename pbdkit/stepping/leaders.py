@@ -474,8 +474,8 @@ class PlaceLeaders(LeaderOperation):
         return [at for each in self.scene.leading for at in each.group.events(steps)]
 
     def hindrance(self, mode: Mode) -> Hindrance | None:
-        """Return a reason if groups move by Newton's law, because the forces on them are computed
-        on the host and from state variables that are on the host."""
+        """Return the reason why groups that move by Newton's law do not support a mode. The forces
+        on them are computed on the host and from state variables that are on the host."""
         if not any(isinstance(leading.group.motion, Newton) for leading in self.scene.leading):
             return None
         reasons = {

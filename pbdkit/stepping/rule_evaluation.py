@@ -197,7 +197,7 @@ class Evaluator:
         return self._model.load(cell, self._scene.constants.of_bond(*limits, *shown(own)), self._q)
 
     def breaks(self, d: Vector, r: Vector, limits: Any, own: Sequence[Any]) -> Any:
-        """Return whether bonds with these state variables break."""
+        """Return whether bonds with the given state variables break."""
         c = self._scene.constants.of_bond(*limits, *shown(own))
         return as_verdict(self._model.breaks(d, r, c, self._q))
 

@@ -321,8 +321,7 @@ class Operation(ABC):
         return Reach()
 
     def sweeps(self) -> int:
-        """Return how many times, one after the other, the operation evaluates neighbours in a
-        step."""
+        """Return the number of successive evaluations of neighbours by the operation in a step."""
         return 0
 
     def carries(self) -> Indices:

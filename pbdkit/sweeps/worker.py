@@ -158,7 +158,7 @@ class SelectiveSink(MemorySink):
 
 
 def selected_columns(columns: list[Column], variables: set[str] | None) -> list[Column]:
-    """Return the columns of these variables, and the coordinates of their dimensions.
+    """Return the columns of the given variables, and the coordinates of their dimensions.
 
     For variables of particles the reference positions are included too.
     """

@@ -491,7 +491,7 @@ class Property:
 def property_of(
     *interfaces: type[Component], is_needed: bool = False
 ) -> Callable[[Check], Property]:
-    """Return a decorator that registers a check as a property of these interfaces, by default
+    """Return a decorator that registers a check as a property of the given interfaces, by default
     of all interfaces.
 
     The name of the property is that of the function.

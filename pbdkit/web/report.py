@@ -298,7 +298,7 @@ class BondArrays:
         }
 
     def broken(self, particles: Rows) -> dict[str, Any]:
-        """Return the data about breaking of the bonds between these particles."""
+        """Return the data about breaking of the bonds between the given particles."""
         rows, place = self._between(particles), np.full(len(self.ends), -1)
         place[self.order] = np.arange(1, len(self.order) + 1)
         return {

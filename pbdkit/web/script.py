@@ -47,7 +47,7 @@ class ManualMotion(Motion):
     _displacements: list[Displacement] = PrivateAttr(default_factory=list)
 
     def offset(self, n: float, start: Floats) -> Floats:
-        """Return the offset at step n of the path with these knots."""
+        """Return the offset at step n of the path with the given knots."""
         if not self._steps:
             return np.zeros(2)
         # The lists are shared, because copying the path at each call would take time in proportion

@@ -106,8 +106,8 @@ class Viewer(ABC):
     """The frame that was sent last."""
 
     def awaits(self, picture: int) -> bool:
-        """Return whether a picture can be sent, and the picture with this number has not been sent
-        to the viewer yet."""
+        """Return whether a picture can be sent, and the picture with the given number has not been
+        sent to the viewer yet."""
         return self.is_ready and (self.last_frame is None or self.last_frame.picture != picture)
 
     @abstractmethod

@@ -567,7 +567,7 @@ class Session:
             raise
 
     def _forget_later(self) -> None:
-        """Remove changes after this step."""
+        """Remove the changes after a step."""
         if self.step < self.end:
             self.end = self.step
             self.script.cut_back(self.step)

@@ -193,7 +193,7 @@ several milliseconds."""
 
 
 def load_kernel(source: str, functions: dict[str, Function], arguments: tuple[Any, ...]) -> Any:
-    """Return the function `run` of a kernel with this source. The kernel is loaded from the cache
+    """Return the function `run` of a kernel, given its source. The kernel is loaded from the cache
     or compiled, and is called once with the arguments.
 
     The key covers the source of every function that rule and fracture model call, so that a kernel

@@ -47,8 +47,8 @@ def write_kernel(plan: Plan, program: Program, groups: Groups) -> tuple[str, lis
 
 
 def write_module(plan: Plan, functions: Iterable[Function], run: Function) -> tuple[str, list[str]]:
-    """Return the source of a module with these functions and the entry `run`, and the names of the
-    arrays that it reads."""
+    """Return the source of a module with the given functions and the entry `run`, and the names of
+    the arrays that it reads."""
     jit = f'@njit(parallel={plan.parallel}, error_model="numpy", nogil=True, cache=CACHED)'
     head = [jit, f"def run({', '.join(run.own)}):", f"    {', '.join(run.used)}, = arrays"]
     return module_text(plan, functions, head, run), run.used
@@ -57,7 +57,7 @@ def write_module(plan: Plan, functions: Iterable[Function], run: Function) -> tu
 def module_text(
     plan: Plan, functions: Iterable[Function], head: Iterable[str], run: Function
 ) -> str:
-    """Return the source of a module with these functions and `run`, the signature of which is
+    """Return the source of a module with the given functions and `run`, the signature of which is
     `head`."""
     visible = plan.levels[-1].seen
     kinds = {"Fracture": visible.fracture, "Constants": visible.bond}

@@ -257,12 +257,12 @@ class Plan:
         return f"Vector({', '.join(self.each(pattern))})"
 
     def literal(self, values: Iterable[float]) -> str:
-        """Return a vector of these numbers."""
+        """Return an expression for a vector of the given numbers."""
         return f"Vector({', '.join(map(self.number, values))})"
 
     def row(self, array: str, first: object, step: Sequence[object] | None = None) -> str:
-        """Return an expression for columns j0 to j1 of a row or, with `step`, for the cells that
-        are this step away from them."""
+        """Return an expression for columns j0 to j1 of a row or, with `step`, for the cells at the
+        offset `step` from them."""
         *lead, last = step or [0] * self.scene.axes
         at = [_sum(name, m) for name, m in zip(self.lead, lead, strict=True)]
         return f"{array}[{', '.join([str(first), *at])}, {_sum('j0', last)}:{_sum('j1', last)}]"

@@ -102,8 +102,8 @@ def damage_lines(plan: Plan) -> list[str]:
 
 
 def torn_at_slot(plan: Plan) -> list[str]:
-    """Return lines of code that compute t, the damage of the bond along slot k of the particle and
-    of the cells beside this bond."""
+    """Return lines of code that compute t for the bond along slot k of the particle. The variable t
+    contains the damage of the cells on both sides of this bond and of the bond itself."""
     sides = (f"around[slot_cells[s, k, {side}]]" for side in (0, 1))
     plane = "slot_planes[s, k]"
     lines = [f"own = {_damage_at(plan, 'owner', plane)}", "other = own"]
@@ -444,7 +444,7 @@ def more_contributions(
     plan: Plan, level: Level, r: str, weights: Sequence[str], there: Iterable[str] = ()
 ) -> list[str]:
     """Return lines that compute the contributions of cells with a stiffness other than that of the
-    rule, with these weights."""
+    rule, with the given weights."""
     lines = list[str]()
     for w in weights:
         lines.append(_gathered(plan, level, r, w, there, "e", plan.tears))
@@ -741,8 +741,8 @@ def write_whole(
 
 
 def write_torn_row(plan: Plan, level: Level, s: int, kind: int) -> Function:
-    """Return the function that moves the marked ones of particles j0 to j1 of a row of this kind.
-    All arrays begin at j0, so that the loops are vectorised."""
+    """Return the function that moves those of the particles j0 to j1 that are marked, in a row of a
+    given kind. All arrays begin at j0, so that the loops are vectorised."""
     out = Function(plan.shared, f"torn{level.number}_{s}_{kind}", *plan.lead, "j0", "j1")
     damage = RowDamage(plan, s)
     out.add(0, *parameters(plan, level))
