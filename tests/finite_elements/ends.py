@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 from finite_elements.specimen import FORCE, HEIGHT, LENGTH, THICKNESS, Data, Plate, lame, read
-from finite_elements.updating import MARGIN, Estimate, Found, alike, ways
+from finite_elements.updating import MARGIN, Estimate, Found, alike, relative_positions
 from scipy.optimize import least_squares
 from skfem import FacetBasis, LinearForm
 
@@ -89,7 +89,7 @@ def _fall(strength: Estimate, box: float) -> Estimate:
 
 def halves(points: np.ndarray) -> np.ndarray:
     """x² on the left of the hole's middle, and on the right; both are smooth there."""
-    along = ways(points)
+    along = relative_positions(points)
     parts = np.column_stack([np.minimum(along, 0.0) ** 2, np.maximum(along, 0.0) ** 2])
     return np.concatenate([parts, np.zeros_like(parts)])
 
@@ -98,7 +98,7 @@ def straightened(strength: float) -> dict[str, End]:
     """The ends, with the distortion taken away."""
     data = read().inside(MARGIN)
     u = data.displacements.copy()
-    u[:, 0] -= strength * ways(data.points) ** 2
+    u[:, 0] -= strength * relative_positions(data.points) ** 2
     return ends(Data(data.points, u))
 
 
