@@ -193,8 +193,8 @@ def _plasticity() -> str:
     return f"""## Pieces after a fracture
 
 After a fracture the rule of each end of a broken bond uses a fictitious point at m_j + λ R.
-According to the paper an edge recovers its shape if λ = 1, and otherwise loosens or contracts. Here
-a sheet is torn by a right edge that moves by 1.2 per step, and {SETTLED} steps are made. The
+According to the paper, an edge recovers its shape if λ = 1, and otherwise loosens or contracts.
+Here a sheet is torn by a right edge that moves by 1.2 per step, and {SETTLED} steps are made. The
 table gives the final strain of the piece at the clamp, measured from its left column to its torn
 column:
 
@@ -214,7 +214,7 @@ It is the effect of a permanent load on the broken edge:
 {torn_text(5.2, 1.2, steps=400)}```
 
 The right column can be released at step 20 instead of being held. It is then a free body with one
-broken side, which comes to rest only if λ = 1. After {300} steps the column moves by
+broken side, which comes to rest only if λ = 1. After {300} steps, the column moves by
 {drift[0.8]:.4f} per step for λ = 0.8, by {drift[1.0]:.4f} for λ = 1 and by
 {drift[1.2]:.4f} for λ = 1.2. The velocity is (1 − λ)/4 and constant:
 

@@ -87,7 +87,7 @@ def _fields() -> list[Claim]:
         ),
         Claim(
             "those close to the frame follow with a little delay owing to the rule of the frame",
-            "Within a step the leaders move before the frame. With four neighbours this order has "
+            "Within a step the leaders move before the frame. With four neighbours, this order has "
             "no effect, and the displacements of the middle and the edge differ by "
             f"{a.spread():.1g}. At step 9, they differ by {middle_8 - edge_8:.3f} with eight "
             f"neighbours and by {middle - edge:.3f} with a frame delayed by one step.",
@@ -200,7 +200,7 @@ def _history() -> list[Claim]:
         Claim(
             "later decrease with parabolic like behaviour to the original position",
             f"{both_text(x, top)}. Over the whole decrease the two values of R² "
-            f"differ by {abs(whole[1] - whole[0]):.0e}. At step 400 the displacement is "
+            f"differ by {abs(whole[1] - whole[0]):.0e}. At step 400, the displacement is "
             f"{x[400]:.3f}; its "
             f"maximum was {x[top]:.3f}.",
             parabolic(whole),

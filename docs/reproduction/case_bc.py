@@ -157,7 +157,7 @@ def _claims_c() -> list[Claim]:
             "a lower lateral contraction [of 67], with respect the first gradient case",
             "The contraction is measured by −u_y of particle 67 at steps 9, 19 and 99. It is "
             f"{_listed(first)} in b, and {_listed(second)} in c. It is larger in c than in b at "
-            f"steps {above[0]} to {above[-1]}, and smaller afterwards. With 24 neighbours the "
+            f"steps {above[0]} to {above[-1]}, and smaller afterwards. With 24 neighbours, the "
             f"contraction is {_listed(third)} at steps 9, 19 and 99; at steps {above_24[0]} to "
             f"{above_24[-1]} it is larger than in b.",
             not above,

@@ -189,7 +189,7 @@ def _rebound() -> list[Claim]:
         ),
         Claim(
             "some fast point on its right try to deviate it to the right",
-            "In `paper/d2-frame-bonds` the edge is pulled by bonds to frame points that remain "
+            "In `paper/d2-frame-bonds`, the edge is pulled by bonds to frame points that remain "
             "near the torn column. Without these bonds the piece returns: the largest "
             f"displacement in `paper/d2` at step 400 is {two.residual():.3f}.",
             rebound(x_of(two)) is not None,

@@ -61,7 +61,7 @@ def _claims() -> list[Claim]:
     return [
         Claim(
             "remote particles are not interested in what is going on close to the leaders [time 9]",
-            f"At step 8 the displacement of the rim is {rim_share(e, 8):.1%} of that of the "
+            f"At step 8, the displacement of the rim is {rim_share(e, 8):.1%} of that of the "
             f"leaders; the rim first moves at step {start}.",
             rim_share(e, 8) < 0.02,
         ),
@@ -77,7 +77,7 @@ def _claims() -> list[Claim]:
             "the local action principle [is verified]",
             "The rim is displaced later than the leaders, but its displacement does not decay: it "
             f"is {rim_share(e, 100):.1%} of that of the leaders at step 100, and "
-            f"{rim_share(e, 400):.1%} from step 400 on. In a sheet of 40 × 40 it is "
+            f"{rim_share(e, 400):.1%} from step 400 on. In a sheet of 40 × 40, it is "
             f"{late[0]:.1g} at step 8, {late[1]:.1%} at step 400 and {late[2]:.1%} at step 4000. "
             "At four times the distance r the final displacement is thus "
             f"{rim_share(e, 400) / late[2]:.2f} times smaller: it decreases as 1/r.",

@@ -118,7 +118,7 @@ def _one_shell() -> list[Claim]:
         Claim(
             "in the square lattice this [rebound] behaviour does not exist",
             "Figure 16 of the paper shows a rebound. There is none in the runs of "
-            "`paper/d1` and `paper/d2`. In `paper/d2-frame-bonds` the x displacement of particle "
+            "`paper/d1` and `paper/d2`. In `paper/d2-frame-bonds`, the x displacement of particle "
             f"103 decreases to {back_square[1]:.3f} and then increases to {back_square[2]:.3f}.",
             not any(square.values()),
             "`paper/d1` and `paper/d2`, but not with `paper/d2-frame-bonds`",

@@ -228,7 +228,7 @@ def _shape() -> list[Claim]:
             "varying the distances of the fictitious elements … plastic-like … behaviours",
             "A plastic strain would depend on the previous deformation. At thresholds of "
             f"{which(PULLS)} the right column had moved by {which(ways)} when the sheet separated. "
-            f"With λ = 1.2 the remaining strains are {', '.join(f'{s:.5f}' for s in stays[1.2])}. "
+            f"With λ = 1.2, the remaining strains are {', '.join(f'{s:.5f}' for s in stays[1.2])}. "
             "The remaining strain is always λ − 1, because it is the effect of a permanent load on "
             "the broken edge.",
             float(np.ptp(stays[1.2])) > 0.01,

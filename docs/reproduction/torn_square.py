@@ -65,7 +65,7 @@ def both() -> str:
         "| | independent, 6.0 | 5.2 | 6.0 |\n| --- | --- | --- | --- |\n"
         f"{rows}\n\n"
         "The motion of particle 103 along x was also examined at all thresholds at which the sheet "
-        "separates. With two shells and unbreakable bonds to the frame it has a rebound at "
+        "separates. With two shells and unbreakable bonds to the frame, it has a rebound at "
         f"{kinds(swept('two shells, unbreakable frame bonds'))}, and with 24 neighbours at "
         f"{kinds(swept('24 neighbours'))}."
     )

@@ -55,7 +55,7 @@ def _settings() -> list[str]:
         "Figure 21 is reproduced with thresholds of 5.1 (`paper/f2-cusp`): a second fracture at "
         f"step {cusp}, no rebound, and a final displacement of "
         f"{run('paper/f2-cusp').residual():.3f}. With one shell, there is a rebound at 5.1 too "
-        f"({turn[1]:.2f} to {turn[2]:.2f}). At 5.2 the final displacement of the sheet with two "
+        f"({turn[1]:.2f} to {turn[2]:.2f}). At 5.2, the final displacement of the sheet with two "
         f"shells is {torn[1]:.2f}.",
         f"**The rebound of figure 16** is permanent ({low[1]:.2f} to {low[2]:.2f}) only if "
         "bonds to the frame never break. The sheet then does not return (largest displacement "

@@ -79,7 +79,7 @@ def _welcome() -> str:
 def main(arguments: list[str] | None = None) -> None:
     """Run the program and return its exit status. It is 0 after success, 1 for a defect of pbdkit,
     2 for an invalid experiment or call, and 3 for a missing or broken plugin. It is 4 if the run
-    diverged, 5 if part of a sweep failed, and 6 if storage failed. After an interrupt it is 130,
+    diverged, 5 if part of a sweep failed, and 6 if storage failed. After an interrupt, it is 130,
     and after any other signal 128 plus the number of the signal."""
     with standard_streams():
         code = _exit_status(arguments)

@@ -271,8 +271,8 @@ class Strain(Diagnostic):
 class LocalRotation(Diagnostic):
     """Rotation angle of the cells around each particle inside the outline; 0 without cells.
 
-    With the polar decomposition F = R U it is the angle of the rotation R, counterclockwise from -π
-    to π: atan2(F_yx - F_xy, F_xx + F_yy).
+    With the polar decomposition F = R U, it is the angle of the rotation R, counterclockwise from
+    -π to π: atan2(F_yx - F_xy, F_xx + F_yy).
     """
 
     type: Literal["rotation"] = "rotation"
@@ -407,9 +407,9 @@ TwoPoints = Annotated[tuple[Place, Place], Field(strict=False)]
 class StrainEnergy(Diagnostic):
     """Strain energy of the body.
 
-    For a linear calibrated rule with the stiffness K it is ½ uᵀK u, for a nonlinear rule
-    ('springs') the energy of the bonds. With a frame that has points it is -½ Σ u·f with the forces
-    f. In linear elasticity, this is the work of the leaders.
+    For a linear calibrated rule with the stiffness K, it is ½ uᵀK u, for a nonlinear rule
+    ('springs') the energy of the bonds. With a frame that has points, it is -½ Σ u·f with the
+    forces f. In linear elasticity, this is the work of the leaders.
     """
 
     type: Literal["strain-energy"] = "strain-energy"

@@ -317,7 +317,7 @@ class Damage(Draws, Softens, RenewsBonds, BreaksAtStrain, Parting):
     the barycentre rule the force (1 - D) ε of the bond decreases linearly from its value at the
     onset to zero at failure.
 
-    With `scatter` s both strains of a bond are multiplied by the same random factor, from the
+    With `scatter` s, both strains of a bond are multiplied by the same random factor, from the
     uniform distribution over 1 ± s. It depends on the seed of the experiment.
     """
 

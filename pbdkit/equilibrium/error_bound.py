@@ -199,7 +199,7 @@ class EquilibriumPredictor:
     doubled, and the correction has to reduce the moves to a tenth.
 
     A prediction depends on the state only, so that a resumed run has the same predictions as an
-    uninterrupted one. For this reason only factors of matrices are stored between two predictions:
+    uninterrupted one. For this reason, only factors of matrices are stored between two predictions:
     the results of iterative solvers would depend on earlier solutions.
     """
 

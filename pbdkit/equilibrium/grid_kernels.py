@@ -102,7 +102,7 @@ def beside(q, half):
     """Return the two places of the next grid between which a place of this grid lies, and the
     weight of the first of them in the interpolation. The place of this grid is q places away from
     the one that coincides with the centre of a coarse stencil. The results are counted from that
-    centre: -1, 0 or 1. With `half` the next grid has half the places along the axis."""
+    centre: -1, 0 or 1. With `half`, the next grid has half the places along the axis."""
     if not half:
         return q, q, 1.0
     return (q - 1) // 2 if q % 2 else q // 2, (q + 1) // 2, 0.5 if q % 2 else 1.0

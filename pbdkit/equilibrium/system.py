@@ -48,7 +48,7 @@ class Moves:
     """Evaluation of the moves of a scene's followers.
 
     Moves include relaxation but not momentum. Frame points follow the body, and obstacles have
-    their positions at the given moment. With `compiles` the evaluation is compiled for large
+    their positions at the given moment. With `compiles`, the evaluation is compiled for large
     bodies. Compiling takes seconds and saves time if many states of one scene are evaluated.
     """
 

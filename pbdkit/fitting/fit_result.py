@@ -388,8 +388,8 @@ def _residuals_of(observation: Observation, residuals: Floats, loss: Loss) -> Mi
 def unit_of(observation: Observation) -> tuple[float, str]:
     """Return the factor and the unit that convert an observation to the units of the experiment.
 
-    Forces are in N, and lengths in lattice units. Without units the factor is 1, and the unit is an
-    empty text.
+    Forces are in N, and lengths in lattice units. Without units, the factor is 1, and the unit is
+    an empty text.
     """
     units = observation.experiment.units
     if units is None:

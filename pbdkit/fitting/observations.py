@@ -826,7 +826,7 @@ class CurveObservation(RunObservation):
         """Return displacements or times, and forces, at recorded steps, (step,).
 
         Forces are divided by Young's modulus and thickness. The curve ends where the group stops or
-        reverses its motion. After a run has converged the force is constant.
+        reverses its motion. After a run has converged, the force is constant.
         """
         tables, places, forces = Tables(run.scene), [], []
         for moment, state in self._recorded(run):

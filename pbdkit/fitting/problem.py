@@ -2,7 +2,7 @@
 
 Residuals are divided by their noise. The iteration is restricted to identifiable directions.
 
-The initial guess minimises the equilibrium gap. For the true parameters θ the measured
+The initial guess minimises the equilibrium gap. For the true parameters θ, the measured
 displacements u are in equilibrium: the moves m(u, θ) are zero at all particles of which all
 neighbours are measured. Because m is nearly linear in θ, θ is computed by solving a few linear
 problems, without computing an equilibrium (Claire, Hild and Roux 2004). The guess is biased by

@@ -371,7 +371,7 @@ class Specimens:
     def tear(self, experiment: Experiment) -> Specimen:
         """Simulate a specimen until it has lost half of its peak force.
 
-        The experiment may differ from that of the scene in parameters and seed. Between increments
+        The experiment may differ from that of the scene in parameters and seed. Between increments,
         the load is scaled until the next bond breaks.
         """
         scene = scene_like(self.scene, experiment)
@@ -602,7 +602,7 @@ class UniformLaw(StrengthLaw):
     def whole(path: str) -> float:
         """Return a value with which no bond breaks, or zero scatter.
 
-        For the failure strain it is a strain that no bond reaches.
+        For the failure strain, it is a strain that no bond reaches.
         """
         return 1e60 if path == "fracture.failure" else 0.0
 

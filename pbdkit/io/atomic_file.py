@@ -117,7 +117,7 @@ class NewFile(io.RawIOBase):
 
     If a write failed, HDF5 would repeat it when the process ends, and crash. Other libraries lose
     the rest of an incomplete write. In this class every write is complete, and no write raises an
-    exception. After the first fault nothing more is written, and `check` raises the fault. The
+    exception. After the first fault, nothing more is written, and `check` raises the fault. The
     class has no method `fileno`, because libraries could use it to bypass the class.
     """
 

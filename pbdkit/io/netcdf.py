@@ -257,7 +257,7 @@ WAITING = "waiting."
 
 
 class NetcdfSink(KeepingSink):
-    """Sink that writes a temporary file in the folder of `path`. After a second the file is
+    """Sink that writes a temporary file in the folder of `path`. After a second, the file is
     committed and becomes the records of an unfinished run. `finish` renames it to `path`. `origin`
     are the arguments of the command.
 

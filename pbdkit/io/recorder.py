@@ -169,7 +169,7 @@ class RecordedVariables:
         which `which` returns true. Returns values by variable.
 
         Raises PluginError if a shape differs from the declared one, and FloatingPointError if a
-        value is not finite. At the end of a run values that are not finite are kept, because the
+        value is not finite. At the end of a run, values that are not finite are kept, because the
         run may have ended because of them.
         """
         values: Values = {}

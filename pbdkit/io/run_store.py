@@ -84,7 +84,7 @@ class RunStore:
     def __init__(self, path: Path, *, mode: str = "ro") -> None:
         """Open a store; `mode` is ro, rw, or rwc to create it.
 
-        With ro, nothing on the disk is changed, even if the store is damaged. With rw SQLite would
+        With ro, nothing on the disk is changed, even if the store is damaged. With rw, SQLite would
         discard a damaged log. Therefore `check` must be called, and the header of the records be
         verified, before a store is opened with rw.
         """

@@ -152,8 +152,8 @@ class OverlappingSink(KeepingSink):
         self._inner.suspend(checkpoint)
 
     def keep_final(self, checkpoint: Checkpoint) -> None:
-        """Store the final state after all values are written. After this call only final values are
-        written."""
+        """Store the final state after all values are written. After this call, only final values
+        are written."""
         self._wait()
         self._inner.keep_final(checkpoint)
 

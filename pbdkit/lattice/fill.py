@@ -818,7 +818,7 @@ def cut_by_border(
     Notes
     -----
     The method is that of `shares_inside`, but triangles in which the distance is not linear are
-    divided further. For this reason layers that are far thinner than a cell are resolved.
+    divided further. For this reason, layers that are far thinner than a cell are resolved.
     """
     points, small = _points_within(x, y)
     distance, count = signed(*points)[small], len(small) * points[0].shape[1]

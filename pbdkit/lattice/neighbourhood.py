@@ -364,7 +364,7 @@ def bonds_in(raster: Raster, block: Block, plane: BondPlane, frame_too: bool) ->
     """Return a mask of the places of a block where a bond starts.
 
     Both ends of a bond are particles, and at least one of them belongs to the body. Without
-    `frame_too` both ends have to belong to the body.
+    `frame_too`, both ends have to belong to the body.
     """
     start = raster.kind[block.slices()]
     end = raster.kind[block.seen_through(plane.slot).slices()]

@@ -167,7 +167,7 @@ class Source:
     def message(self, where: Sequence[str | int], text: str) -> str:
         """Return ``file:line:column: field: text``.
 
-        For a field that does not exist it contains the place of the parent.
+        For a field that does not exist, it contains the place of the parent.
         """
         path = tuple(where)
         while path and path not in self.places:

@@ -162,11 +162,11 @@ class Stepping(Solver):
     """Compute one step after the other.
 
     `relaxation` w and `memory` b modify the move of any rule, for followers only: x(t+1) = m + w ·
-    move + b · (x(t) - x(t-1)). Both can be time-dependent. With `auto` their values are chosen so
+    move + b · (x(t) - x(t-1)). Both can be time-dependent. With `auto`, their values are chosen so
     that the slowest mode of the scene decays fastest; results contain these values. `engine` is
     numpy, compiled or gpu; `auto` selects the faster one of numpy and compiled. `precision` is the
     precision of the computation, and `threads` the number of threads of the compiled engine. With
-    `settle` the run ends when it has converged, at the latest after `steps`.
+    `settle`, the run ends when it has converged, at the latest after `steps`.
     """
 
     type: Literal["stepping"] = "stepping"

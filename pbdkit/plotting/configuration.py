@@ -166,8 +166,8 @@ MAX_BOND_LINES = 200_000
 
 @dataclass(frozen=True)
 class RenderStyle:
-    """Rendering style. With `filled` a field is drawn. If particles are `crowded`, they are not
-    drawn as dots by default. With `lined` a bond is drawn as a single line. `dots` is "values" if
+    """Rendering style. With `filled`, a field is drawn. If particles are `crowded`, they are not
+    drawn as dots by default. With `lined`, a bond is drawn as a single line. `dots` is "values" if
     dots show the quantity, and "classes" if they show its classes. It is "kinds" if they show the
     kinds of particles while colours show another quantity, and "" if there are no dots. `distance`
     is the distance of particles on the page, in points."""

@@ -464,7 +464,7 @@ class Tiling:
     polygons : tuple of CellPolygon
         Cells.
     beside : dict of Slot to (Side, Side)
-        Cells to the left and right of a slot. For a diagonal both are the same cell. The map is
+        Cells to the left and right of a slot. For a diagonal, both are the same cell. The map is
         empty unless two conditions hold: all cells are triangles or parallelograms, and the
         neighbours of every site are the corners of the cells around it. These are 8 neighbours on
         the square and rectangular lattices and 6 on the hexagonal one.

@@ -29,7 +29,7 @@ LARGEST_DIRECT = 3_000
 """Number of particles up to which `auto` selects a direct solver if the system is set up once."""
 LARGEST_REPEATED = 20_000
 """Number of particles up to which `auto` selects a direct solver if systems are set up repeatedly,
-because the rule is nonlinear or bonds break. Beyond it the moves are compiled."""
+because the rule is nonlinear or bonds break. Beyond it, the moves are compiled."""
 
 KERNELS = 48 * 2**20
 """Number of bytes of the compiled functions of multigrid."""
@@ -51,8 +51,8 @@ NONLINEAR_MATRICES = 2
 def equilibrium_size(
     experiment: Experiment, neighbourhood: Neighbourhood, particles: int, grids: bool
 ) -> int:
-    """Return the number of bytes of the linear systems of an equilibrium. With `grids` multigrid is
-    assumed if the method of the solver permits it."""
+    """Return the number of bytes of the linear systems of an equilibrium. With `grids`, multigrid
+    is assumed if the method of the solver permits it."""
     linear = experiment.rule.linear and not experiment.obstacles
     if grids and _on_grids(experiment, neighbourhood, particles):
         return KERNELS + particles * (SHARED_STENCILS if linear else SINGLE_STENCILS)
@@ -271,7 +271,7 @@ def _bytes_an_entry(
     diagnostic: Diagnostic, particles: int, recorded: int, *, in_mm: bool
 ) -> list[float]:
     """Return the number of bytes of one entry of each variable of a diagnostic in the file. With
-    `in_mm` lengths are stored twice, in lattice units and in mm."""
+    `in_mm`, lengths are stored twice, in lattice units and in mm."""
     sizes = {"particle": particles, "axis": 2, "principal": 2}
     sizes |= {name: len(values) for name, values in diagnostic.coordinates().items()}
     sizes |= {diagnostic.own_dimension: OPEN_CHUNK}

@@ -125,7 +125,7 @@ class Outline:
         HALF_PLANE, CIRCLES or POLYGON.
     points
         Points, (point, axis). For a half-plane these are a point on its border and that point plus
-        the unit normal. For circles it is the centre. For a polygon these are the vertices,
+        the unit normal. For circles, it is the centre. For a polygon these are the vertices,
         counterclockwise.
     inner, outer
         Radii of circles; the obstacle lies between them.
