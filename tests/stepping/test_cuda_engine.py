@@ -163,7 +163,7 @@ def test_missing_requirement_is_reported(monkeypatch):
         make_engine(scene, choose(scene))
     monkeypatch.setattr(limits, "find_spec", find_spec)
     if find_spec("numba_cuda") and missing_for_gpu():
-        assert re.search("no GPU|compiler is missing", missing_for_gpu())
+        assert re.search("no NVIDIA GPU|compiler is missing", missing_for_gpu())
 
 
 def test_auto_never_selects_it(monkeypatch):
