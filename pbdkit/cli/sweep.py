@@ -74,8 +74,7 @@ def _client(address: str | None) -> Iterator[Any]:
     # Log messages about lost connections, with tracebacks, would hide the messages of the program.
     logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     try:
-        # The package distributed is untyped.
-        client: Any = distributed.Client(  # type: ignore[no-untyped-call]
+        client: Any = distributed.Client(  # type: ignore[no-untyped-call]  # untyped package
             address, timeout=CONNECT_S
         )
     except (OSError, ValueError, ImportError) as error:
