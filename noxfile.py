@@ -68,8 +68,10 @@ def plugins(session: nox.Session) -> None:
 
 @nox.session
 def installs(session: nox.Session) -> None:
-    """Commands work with all extras, and without them or name the one that they need, in
-    environments that the script makes; `nox -s installs -- --each` tries each extra alone."""
+    """Distributions are built and valid. Commands work with all extras, and without them or name
+    the one that they need, in environments that the script makes; `nox -s installs -- --each` tries
+    each extra alone."""
+    install(session, "release")
     session.run("python", "tests/installs.py", *session.posargs)
 
 

@@ -12,7 +12,7 @@ sys.path.insert(0, str(HERE))
 project = "pbdkit"
 copyright = "the pbdkit developers"
 DISTRIBUTION = metadata("pbdkit")
-version = release = DISTRIBUTION["Version"]
+version = release = DISTRIBUTION["Version"].partition("+")[0]
 urls = dict(entry.split(", ") for entry in DISTRIBUTION.get_all("Project-URL") or [])
 
 extensions = [

@@ -1,7 +1,8 @@
 """Test commands without extras, and with them: ``python tests/installs.py [--each]``.
 
-`pip install` puts the wheel of this checkout into an environment of its own, in which commands work
-or name the extra that they need. The extra `all` has a further environment, which holds what pip
+The wheel is built from the source distribution of this checkout, and `twine` checks both. `pip
+install` puts it into an environment of its own, in which commands work or name the extra that they
+need. The extra `all` has a further environment, which holds what pip
 adds for it and takes the rest from the first. `--each` does the same with every extra alone
 instead: what one extra brings is of no use to what needs another. `gpu` is left out: it takes half
 a gigabyte, and has a session of its own in noxfile.py. In each environment every row of `CASES` is
@@ -176,8 +177,12 @@ def _extras() -> dict[str, set[str]]:
 
 
 def _wheel(folder: Path) -> Path:
-    _pip("wheel", "--no-deps", "--wheel-dir", str(folder), str(ROOT))
-    (wheel,) = folder.glob("*.whl")
+    """Build the source distribution and from it the wheel, check both, and return the wheel."""
+    subprocess.run([sys.executable, "-m", "build", "--outdir", folder, ROOT], check=True)
+    built = sorted(folder.iterdir())
+    subprocess.run([sys.executable, "-m", "twine", "check", "--strict", *built], check=True)
+    source, wheel = sorted(built, key=lambda path: path.suffix)
+    assert (source.suffix, wheel.suffix) == (".gz", ".whl"), built
     return wheel
 
 

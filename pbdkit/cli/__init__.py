@@ -13,6 +13,7 @@ from typing import Any
 
 import click
 
+import pbdkit
 from pbdkit import errors
 from pbdkit.cli.commands import CommandTable, builtin_commands
 from pbdkit.cli.options import with_no_plugins
@@ -59,12 +60,28 @@ MORE = """\
     "docs/experiments.md.",
 )
 @click.option("--debug", is_flag=True, help="Show a traceback if a command fails.")
-@click.version_option(package_name="pbdkit")
+@click.option("--version", is_flag=True, help="Print the version.")
+@click.option(
+    "--verbose",
+    is_flag=True,
+    help="With --version: also the system, dependencies and plugins, for the report of a defect.",
+)
 @click.pass_context
-def program(context: click.Context, debug: bool) -> None:
+def program(context: click.Context, debug: bool, version: bool, verbose: bool) -> None:
     """Position-based dynamics of deformable bodies on lattices: rules instead of forces."""
+    if version:
+        click.echo(_version_report() if verbose else f"pbdkit {pbdkit.__version__}")
+        context.exit()
+    if verbose:
+        raise click.UsageError("--verbose: requires --version, as in `pbdkit --version --verbose`")
     if context.invoked_subcommand is None:
         click.echo(_welcome())
+
+
+def _version_report() -> str:
+    from pbdkit.cli.version import version_report
+
+    return version_report()
 
 
 def _welcome() -> str:

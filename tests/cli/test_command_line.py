@@ -13,6 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import xarray
 
@@ -322,6 +323,21 @@ def test_file_appears_only_when_complete(call: Call, probing: Probing) -> None:
     assert call(*PROBED).code == 0
     seen = sys.modules["pbdkit_probe"].seen
     assert ("e.json" in seen, "tensile.nc" in seen) == (True, False)
+
+
+def test_version_report_lists_what_a_defect_can_depend_on(
+    call: Call, install: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    install("pbdkit-extra", "def pbdkit_components(): return []", "2.5")
+    monkeypatch.setenv("PBDKIT_CACHE_DIR", "/kept")
+    assert call("--version").out == f"pbdkit {pbdkit.__version__}\n"
+    first, *lines = call("--version", "--verbose").out.splitlines()
+    rows = dict(line.split(maxsplit=1) for line in lines)
+    assert first == f"pbdkit {pbdkit.__version__}"
+    assert rows.keys() >= {"python", "system", "processors", "memory", "pint", "emcee", "mpi4py"}
+    assert (rows["numpy"], rows["PBDKIT_CACHE_DIR"]) == (np.__version__, "/kept")
+    assert rows["pbdkit-extra"].startswith("2.5")
+    assert "as in `pbdkit --version --verbose`" in call("--verbose").err
 
 
 HELP = "from pbdkit.cli import main\ntry: main(['--help'])\nexcept SystemExit: pass"
