@@ -25,7 +25,7 @@ extensions = [
     "sphinx_copybutton",
     "sphinx_design",
 ]
-exclude_patterns = ["reproduction/*", "pictures/*"]
+exclude_patterns = ["paper/*", "reproduction/*", "pictures/*"]
 
 # Markdown. Pages with a kernel in their head are notebooks, run when the site is built.
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
