@@ -220,8 +220,8 @@ def test_sources_named_in_text_exist(page):
 
 
 def test_pages_for_users_have_a_figure_or_an_example():
-    """Reports and decisions aside; the gallery is generated with pictures."""
-    apart = {"validation", "decisions", "gallery"}
+    """Reports, decisions and the paper of a journal aside; the gallery consists of pictures."""
+    apart = {"validation", "decisions", "gallery", "paper"}
     pages = [p for p in (ROOT / "docs").rglob("*.md") if apart.isdisjoint(p.parts)]
     shown = re.compile(r"!\[|^ *```(?!\{toctree\}|$)|^\n {4}\S", re.M)
     assert [page.name for page in pages if not shown.search(page.read_text())] == []
