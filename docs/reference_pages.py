@@ -1,7 +1,7 @@
 """Directives that generate reference pages at build time.
 
 `{commands}` renders the commands of the command line from their click objects, `{keys}` the keys of
-experiment files from the JSON Schema.
+experiment files from the JSON Schema, `{claims}` the promises with their tests and figures.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any
 
 import click
 from docutils import nodes
+from ruamel.yaml import YAML
 from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
@@ -24,6 +25,9 @@ Schema = dict[str, Any]
 
 SCHEMA = Path(__file__).parent.parent / "schemas" / "experiment.schema.json"
 """Schema of experiments with the built-in components."""
+
+CLAIMS = Path(__file__).parent.parent / "tests" / "reliability" / "claims.yaml"
+FIGURES = Path(__file__).parent / "validation" / "trials.jsonl"
 
 UNIT_PATTERN = "µ"
 """Part of the pattern of a text with a unit."""
@@ -37,6 +41,7 @@ def setup(app: Sphinx) -> dict[str, bool]:
     """Register the directives with Sphinx."""
     app.add_directive("commands", Commands)
     app.add_directive("keys", Keys)
+    app.add_directive("claims", Claims)
     return {"parallel_read_safe": True}
 
 
@@ -57,6 +62,49 @@ class Keys(SphinxDirective):
         schema = json.loads(SCHEMA.read_text("utf-8"))
         text = "\n".join(key_sections(schema))
         return self.parse_text_to_nodes(text, allow_section_headings=True)
+
+
+class Claims(SphinxDirective):
+    """Table of what pbdkit promises, the tests of it and the last figures of each trial."""
+
+    def run(self) -> list[nodes.Node]:
+        """Return the table and the commits and machines of its figures."""
+        for source in (CLAIMS, FIGURES):
+            self.env.note_dependency(str(source))
+        records = map(json.loads, FIGURES.read_text("utf-8").splitlines())
+        claims = YAML(typ="safe").load(CLAIMS)
+        return self.parse_text_to_nodes("\n".join(claim_rows(claims, list(records))))
+
+
+def claim_rows(claims: list[dict[str, Any]], records: list[dict[str, Any]]) -> Iterator[str]:
+    """Yield the Markdown of the claims, each with its last record, and of the machines."""
+    latest = {record["claim"]: record for record in records}
+    yield "| claim | in every change, `tests/` | trial | every | last figures |\n| " + "--- | " * 5
+    for claim in claims:
+        nights = claim.get("nights", 1)
+        tests = ", ".join(f"`{name}`" for name in claim["suite"])
+        row = [claim["claim"], tests, f"`{cell(claim['trial'])}`"]
+        row += ["night" if nights == 1 else f"{nights} nights"]
+        yield "| " + " | ".join([*row, last_figures(latest.get(claim["claim"]))]) + " |"
+    yield "\nThe machines of these figures:\n"
+    yield from sorted({f"- {machine_text(record)}" for record in latest.values()})
+
+
+def last_figures(record: dict[str, Any] | None) -> str:
+    """Return the cell of the last run of a trial."""
+    if record is None:
+        return "not run yet"
+    outcome = "" if record["exit"] == 0 else f"**failed** (status {record['exit']}); "
+    what = f"{record['date']}, `{record['commit']}`, {record['seconds']} s: {outcome}"
+    return what + "; ".join(cell(line) for line in record["figures"])
+
+
+def machine_text(record: dict[str, Any]) -> str:
+    """Return the description of the machine of a record."""
+    machine = record["machine"]
+    versions = ", ".join(f"{name} {machine[name]}" for name in ("python", "numpy", "numba"))
+    processors = f"{machine['processor']}, {machine['processors']} processors"
+    return f"{processors}, {machine['system']}, {versions}"
 
 
 def command_sections() -> Iterator[str]:

@@ -237,8 +237,8 @@ def test_readme_lists_the_two_commands_of_ci():
 
 
 FENCES = {"python", "yaml", "console", "sh", "toml", "{code-cell}", "{toctree}", "{eval-rst}",
-          "{glossary}", "{commands}", "{keys}", "{python}", "{include}", "{literalinclude}",
-          "text"}  # fmt: skip
+          "{glossary}", "{commands}", "{keys}", "{claims}", "{python}", "{include}",
+          "{literalinclude}", "text"}  # fmt: skip
 """The kinds of blocks. The first three run above; `toml` is read by
 `plugin/test_documentation`, those in braces by the builder of the site, cells above too. `text` is
 what a terminal shows of a run that others stop: `test_restart` has it."""

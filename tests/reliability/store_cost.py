@@ -110,7 +110,7 @@ def files_of_short_runs(folder: Path) -> int:
     return len(list(folder.iterdir())) - 1
 
 
-def main() -> None:
+def main() -> int:
     asked = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     asked.add_argument("--turns", type=int, default=5)
     asked.add_argument("--records", type=int, default=500)
@@ -118,14 +118,16 @@ def main() -> None:
     given = asked.parse_args()
     with tempfile.TemporaryDirectory(dir=given.folder) as name:
         folder = Path(name)
-        row("a run of less than a second leaves 0 files", f"{files_of_short_runs(folder)}")
+        left = files_of_short_runs(folder)
+        row("a run of less than a second leaves 0 files", f"{left}")
         found, told = one_record_in_100_ms(folder, 2 * given.turns, 4.0)
         row("store, 64 KiB each 100 ms: at most 1.05", f"{found:.3f} ({told})")
         found, told = against_raw(folder, given.turns, 20)
         row("20 records, about a second, against raw: at most 1.3", f"{found:.3f} ({told})")
         found, told = against_raw(folder, given.turns, given.records)
         row("recording, store included, against raw: at most 1.5", f"{found:.3f} ({told})")
+    return int(left > 0)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

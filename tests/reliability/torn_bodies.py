@@ -2,6 +2,7 @@
 of the stiffness, and that breaking one more bond never stiffens.
 
 Run `python tests/reliability/torn_bodies.py [--count 500] [--seed 0]` from the root of the project.
+Exits with 1 if a value exceeds 1e-12.
 """
 
 from __future__ import annotations
@@ -24,8 +25,10 @@ from tests.components.test_elasticity_torn import (
     torn_state,
 )
 
+GOAL = 1e-12
 
-def main() -> None:
+
+def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=500)
     parser.add_argument("--seed", type=int, default=0)
@@ -59,7 +62,8 @@ def main() -> None:
         ("energy of a turn", "asymmetry", "negative eigenvalue", "stiffening"), worst, strict=True
     ):
         print(f"  {name}: {value:.1e}")
+    return int(worst.max() > GOAL)
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
