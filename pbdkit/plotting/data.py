@@ -57,6 +57,13 @@ def cells_of(site: Array, reference: Array) -> Array:
     return cells
 
 
+def cell_triangles(site: Array, reference: Array) -> Array:
+    """Return the cells as triangles, (triangle, 3): quadrilaterals are divided into two."""
+    cells = cells_of(site, reference)
+    halves = cells[cells[:, 2] != cells[:, 3]][:, [0, 2, 3]]
+    return np.concatenate([cells[:, :3], halves])
+
+
 def triangles_of(reference: Array) -> Array:
     """Return the Delaunay triangles, as an array of shape (triangle, 3). Triangles that bridge gaps
     are omitted. There are none if all places are collinear."""

@@ -5,6 +5,9 @@ const NARROWEST = 300, WIDEST = 560, HEIGHT = 236;
 const LEFT = 58, RIGHT = 14, TOP = 12, BOTTOM = 26;
 export const SERIES = ["#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#8A7600"];
 
+/** A curve of so many points, or fewer, is a table of numbers. */
+export const FEW = 2;
+
 /** A number in few characters: 0.125, 1200, 3.2e-7. */
 export function short(value, digits = 4) {
   if (value === null || value === undefined || Number.isNaN(value)) return "none";

@@ -1,10 +1,13 @@
 /** Interactive simulation: the view of the lattice, and beside it the controls and parameters. */
 
-import { KINDS, KIND_NAMES, gradient } from "./colours.js";
+import { short } from "./chart.js";
+import { KINDS, KIND_NAMES } from "./colours.js";
 import { choice, labelled, make } from "./dom.js";
 import { numberRow, slider } from "./live_numbers.js";
 import { pictureIn } from "./live_picture.js";
 import { handle } from "./live_tools.js";
+import { RANGES, SCALES, legend, none, scaleOf, symmetric, widen } from "./scale.js";
+import { sidesOf, wholeTriangles } from "./tears.js";
 import { LatticeView } from "./view.js";
 
 const FASTEST = 1000; // steps a picture
@@ -28,6 +31,7 @@ export function mountLive(root, send) {
   const live = { send, root, running: false, step: 0, end: 0, received: 0, drawn: 0, wrote: 0, first: null };
   root.classList.add("pbdkit-live");
   live.say = (text) => say(live, text);
+  live.tellValue = () => tellValue(live);
   const gone = (live.gone = new AbortController());
   layOut(live);
   listenToKeys(live, gone.signal);
@@ -51,14 +55,16 @@ const HEARD = {
     live.view?.close();
     live.scene = scene;
     live.title.textContent = scene.name;
-    const bytes = Uint8Array.from(atob(scene.bonds), (c) => c.charCodeAt(0));
-    const bonds = new Uint32Array(bytes.buffer);
+    const bonds = numbersIn(scene.bonds, Uint32Array), triangles = numbersIn(scene.triangles, Uint32Array);
+    const beyond = scene.beyond ? numbersIn(scene.beyond, Float32Array) : null;
     try {
       const { count, spacing } = scene;
       // The view takes the context that is there. Without a graphics card each smooth edge costs.
       const antialias = count <= SMOOTH;
       live.canvas.getContext("webgl2", { antialias, alpha: false, depth: false });
-      live.view = new LatticeView(live.canvas, { count, bonds, spacing });
+      live.view = new LatticeView(live.canvas, { count, bonds, spacing, triangles, beyond });
+      live.sides = sidesOf(triangles, bonds, count);
+      live.triangles = triangles;
     } catch (error) {
       say(live, error.message, true);
       return;
@@ -69,7 +75,8 @@ const HEARD = {
     live.rows = scene.numbers.map((number) => numberRow(number, live.send));
     live.numbers.replaceChildren(...live.rows.map((row) => row.element));
     live.colour.replaceChildren(
-      ...Object.entries(scene.colours).map(([value, words]) => make("option", { value }, words)),
+      make("option", { value: "kind" }, "kind"),
+      ...Object.entries(scene.fields).map(([value, { meaning }]) => make("option", { value }, meaning)),
     );
     const thinned = `Each point represents ${scene.every ** 2} particles; all are stepped.`;
     live.thinned.textContent = scene.every > 1 ? thinned : "";
@@ -80,6 +87,7 @@ const HEARD = {
     live.play.setAttribute("aria-pressed", now.running);
     live.speed.value = Math.log(now.speed) / Math.log(FASTEST);
     live.speedText.textContent = `${now.speed} step${now.speed > 1 ? "s" : ""} per picture`;
+    if (live.colour.value !== now.colour) live.limits = none(); // another page may have selected it
     live.colour.value = now.colour;
     for (const row of live.rows ?? []) row.show(now.numbers[row.name]);
     if (live.view) live.view.setColours(now.colour === "kind" ? "kind" : "values");
@@ -119,8 +127,13 @@ function see(live, buffer) {
   if (broken) {
     live.broken = broken;
     live.masked = null;
+    live.view.setTriangles(wholeTriangles(live.triangles, live.sides, broken));
   }
   live.draw();
+}
+
+function numbersIn(text, Kind) {
+  return new Kind(Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer);
 }
 
 function show(live) {
@@ -129,7 +142,7 @@ function show(live) {
   Object.assign(live, { step: picture.step, end: picture.end });
   view.setPositions(picture.positions);
   view.setValues(picture.values);
-  if (picture.values) setRange(live, picture.high);
+  if (picture.values) setScale(live);
   if (live.fresh) fit(live);
   live.fresh = false;
   maskBonds(live);
@@ -142,13 +155,15 @@ function show(live) {
 
 /** Update the panel: less often than there are pictures, because it takes as long. */
 function tellStep(live) {
-  const { picture } = live;
+  const { picture, view } = live;
   live.wrote = performance.now();
   live.stepText.textContent = `step ${picture.step}`;
   live.past.max = picture.end;
   if (document.activeElement !== live.past || live.running) live.past.value = picture.step;
   live.endText.textContent = picture.step < picture.end ? `of ${picture.end}` : "";
-  live.legend.dataset.by = picture.values ? "values" : "kind";
+  const by = (live.legend.dataset.by = picture.values ? "values" : "kind");
+  if (by === "values") live.byValue.replaceChildren(...legend(view.scaleOfValues, fieldOf(live)));
+  tellValue(live);
 }
 
 /** Draw only broken bonds if there are many at a small distance. */
@@ -172,13 +187,21 @@ function fit({ view }) {
   view.fit([box[0] - room, box[1] - room, box[2] + room, box[3] + room]);
 }
 
-/** Set the range of colours, which changes only if values exceed it or are much smaller. */
-function setRange(live, high) {
-  if (!(live.high >= high && live.high < 4 * high)) {
-    live.high = 1.25 * high;
-    live.most.textContent = live.high.toPrecision(2);
-  }
-  live.view.setRange(0, live.high, false);
+const fieldOf = ({ scene, now }) => scene.fields[now?.colour] ?? { meaning: "", units: "" };
+
+/** Set the scale of colours: over this picture, or over all since the field was selected. */
+function setScale(live) {
+  const { picture: { low, high }, view } = live;
+  const each = live.ranges.value === "each";
+  live.limits = widen(each ? none() : live.limits, [low, high]);
+  view.setScale(scaleOf(symmetric(live.limits), live.scales.value));
+}
+
+/** Show the value at the particle under the mouse. */
+function tellValue({ view, picture, valueText, scene, now }) {
+  const value = picture?.values?.[view.selected.particle];
+  const units = scene.fields[now?.colour]?.units ?? "";
+  valueText.textContent = value === undefined ? "" : `in the ring: ${Number.isNaN(value) ? "no value" : `${short(value)} ${units}`}`;
 }
 
 function layOut(live) {
@@ -194,10 +217,15 @@ function layOut(live) {
   live.speed = slider("speed", 0, 1, 0.01, (value) => {
     send({ do: "speed", steps: Math.round(FASTEST ** value) });
   });
+  live.limits = none();
   live.colour = choice([], (by) => {
-    live.high = null;
+    live.limits = none();
     send({ do: "colour", by });
   });
+  live.ranges = choice(RANGES, () => { live.limits = none(); live.draw(); });
+  live.ranges.value = "each";
+  live.scales = choice(SCALES, () => live.draw());
+  live.valueText = make("p", { className: "faint" });
   live.tools = { lead: button("Lead", () => take(live, "lead")) };
   live.tools.cut = button("Cut", () => take(live, "cut"));
   live.hint = make("p", { className: "faint" });
@@ -209,7 +237,9 @@ function layOut(live) {
   live.rate = make("p", { className: "faint" });
   live.thinned = make("p", { className: "faint" });
   live.legend = legendOf(live);
-  const body = make("div", { className: "body" }, live.canvas, live.overlay);
+  const whole = button("Fit view", () => { fit(live); live.draw(); });
+  whole.title = "Show the whole body (key f)";
+  const body = make("div", { className: "body" }, live.canvas, live.overlay, whole);
   root.replaceChildren(body, make("aside", {}, controls(live), make("footer", {},
     make("div", { className: "judgement" }, "Spectrum: ", live.word, live.why),
     row(button("Save as experiment", () => send({ do: "save" })), live.download),
@@ -243,18 +273,17 @@ function legendOf(live) {
     dot.style.background = KINDS[n];
     return make("span", {}, dot, name);
   });
-  const ramp = make("i", { className: "ramp" });
-  ramp.style.background = gradient(false);
-  live.most = make("span");
+  live.byValue = make("div", { className: "scale" });
+  const choices = row(labelled("Range", live.ranges), labelled("Scale", live.scales));
   return make("div", { className: "legend" },
     make("div", { className: "by-kind" }, ...dots),
-    make("div", { className: "by-value" }, "0", ramp, live.most));
+    make("div", { className: "by-value" }, live.byValue, live.valueText, choices));
 }
 
 /** Select the tool of the mouse: "lead" or "cut". */
 function take(live, tool) {
   live.tool = live.root.dataset.tool = tool;
-  live.hint.textContent = `${HINTS[tool]} The wheel zooms; the key f shows the whole body.`;
+  live.hint.textContent = `${HINTS[tool]} The wheel zooms, dragging beside the body moves the picture.`;
   for (const [name, made] of Object.entries(live.tools)) {
     made.setAttribute("aria-pressed", name === tool);
   }

@@ -10,6 +10,7 @@ export function handle(live, signal) {
   const line = document.createElementNS(SVG, "line");
   live.overlay.replaceChildren(line);
   let held = null; // where the mouse took hold, in the window and on the lattice
+  let pointer = null; // where the mouse is; a finger is nowhere until it touches
   let sent = 0, waiting = false;
 
   const mark = (ax, ay, bx, by) => {
@@ -26,7 +27,7 @@ export function handle(live, signal) {
   };
   view.pans = (x, y) => live.tool === "lead" && meant(live, x, y) < 0;
   live.marks = () => {
-    if (!held) return;
+    if (!held) return hover(live, pointer);
     if (held.tool === "cut") return mark(...held.begin, ...held.now);
     const [x, y] = view.positions.subarray(2 * held.row, 2 * held.row + 2);
     mark(...view.toClient(x, y), ...held.now);
@@ -39,12 +40,16 @@ export function handle(live, signal) {
     canvas.setPointerCapture(event.pointerId);
     held = { begin, now: begin, world: view.toWorld(...begin), row, tool: live.tool };
     live.root.dataset.held = live.tool;
-    if (live.tool === "lead") live.send({ do: "grab", row });
+    if (live.tool === "lead") {
+      live.send({ do: "grab", row });
+      ring(live, row, -1);
+    }
     live.marks();
   });
   on("pointermove", (event) => {
     const now = [event.clientX, event.clientY];
-    if (!held) return hover(live, now);
+    if (event.pointerType !== "touch") pointer = now;
+    if (!held) return hover(live, pointer);
     held.now = now;
     live.marks();
     if (held.tool !== "lead" || waiting) return;
@@ -63,11 +68,15 @@ export function handle(live, signal) {
     forget();
   });
   on("pointercancel", () => { if (held?.tool === "lead") live.send({ do: "release" }); forget(); });
-  on("pointerleave", () => { if (!held) hover(live, null); });
+  on("pointerleave", () => {
+    pointer = null;
+    if (!held) hover(live, null);
+  });
 
   function forget() {
     held = null;
     delete live.root.dataset.held;
+    hover(live, pointer);
   }
 }
 
@@ -77,15 +86,20 @@ function meant(live, x, y) {
   return row >= 0 && live.view.kinds[row] < 2 ? row : -1;
 }
 
-/** Shows what the mouse is on. */
+/** Shows what a press would catch. */
 function hover(live, at) {
-  const { view, root } = live;
+  const { view } = live;
   const row = at && live.tool === "lead" ? meant(live, ...at) : -1;
   const bond = at && live.tool === "cut" ? view.pickBond(...at) : -1;
+  ring(live, row, bond);
+}
+
+function ring({ view, root, tellValue }, row, bond) {
   if (row === view.selected.particle && bond === view.selected.bond) return;
   view.select(row);
   view.selectBond(bond);
   root.dataset.over = row < 0 ? "" : ["leader", "follower"][view.kinds[row]];
+  tellValue();
   view.draw();
 }
 

@@ -1,13 +1,14 @@
 /** The moving lattice with its controls, and beside it what was clicked. */
 
-import { short } from "./chart.js";
-import { KINDS, KIND_NAMES, gradient } from "./colours.js";
+import { KINDS, KIND_NAMES } from "./colours.js";
 import { choice, labelled, make } from "./dom.js";
+import { RANGES, SCALES, legend, none, scaleOf, symmetric, widen } from "./scale.js";
 import { BondStory, ParticleStory } from "./story.js";
 import { Tears } from "./tears.js";
 import { LatticeView } from "./view.js";
 
 const STEPS_A_SECOND = 25;
+const SMALL_PART = 0.1; // of the scale of all steps; the scale of each step is shown instead
 const HINT = "Click a particle or a bond. The wheel or two fingers zoom; dragging moves the picture.";
 
 export class LatticePanel {
@@ -28,7 +29,7 @@ export class LatticePanel {
     this.tears = new Tears(run);
     this.canvas.addEventListener("click", (event) => this.#click(event));
     this.view.fit(box);
-    this.setColour("kind");
+    this.setColour(run.telling()?.name ?? "kind");
     this.setStep(run.times.length - 1);
   }
 
@@ -54,8 +55,9 @@ export class LatticePanel {
   setColour(name) {
     this.colour = this.run.colours.find((colour) => colour.name === name) ?? null;
     this.colours.value = name;
-    this.rangeChoice.hidden = this.fill.hidden = !this.colour;
+    for (const control of [this.rangeChoice, this.scaleChoice, this.fill]) control.hidden = !this.colour;
     this.whole = null;
+    if (this.colour && !this.choseRange) this.ranges.value = this.range = this.#hasDecayed() ? "each" : "all";
     this.#paint();
     if (this.row !== undefined) this.showParticle(this.row);
   }
@@ -105,13 +107,17 @@ export class LatticePanel {
     const { run } = this, last = run.times.length - 1;
     const names = run.colours.map(({ name, meaning }) => [name, meaning]);
     this.colours = choice([["kind", "kind"], ...names], (name) => this.setColour(name));
-    const ranges = [["all", "all steps"], ["now", "this step"], ["typed", "custom"]];
-    this.ranges = choice(ranges, (range) => { this.range = range; this.#paint(); });
+    this.ranges = choice([...RANGES, ["typed", "custom"]], (range) => {
+      Object.assign(this, { range, choseRange: true });
+      this.#paint();
+    });
     this.bounds = ["from", "to"].map((end) => make("input", {
       type: "number", step: "any", "aria-label": `${end} value`, hidden: true,
       onchange: () => this.#paint(),
     }));
     this.rangeChoice = labelled("Range", this.ranges, ...this.bounds);
+    this.scales = choice(SCALES, () => this.#paint());
+    this.scaleChoice = labelled("Scale", this.scales);
     this.filling = make("input", { type: "checkbox", onchange: () => this.#paint() });
     this.filling.checked = run.count > 400;
     this.fill = labelled("Fill", this.filling);
@@ -123,7 +129,7 @@ export class LatticePanel {
     const whole = make("button", { type: "button", onclick: () => this.#showAll() }, "Show all");
     this.find = make("input", { type: "text", placeholder: "particle 12 or bond 12 13", onchange: () => this.#search() });
     this.choices = make("div", { className: "choices" },
-      labelled("Colour", this.colours), this.rangeChoice, this.fill,
+      labelled("Colour", this.colours), this.rangeChoice, this.scaleChoice, this.fill,
       labelled("Displacement factor", drawn), labelled("Find", this.find), whole);
     const act = () => this.play();
     this.button = make("button", { type: "button", onclick: act, disabled: !last }, "Play");
@@ -174,21 +180,17 @@ export class LatticePanel {
 
   /** Hands the colours of this step to the view, draws it, and explains the colours below. */
   #paint() {
-    const { view, colour, run, t } = this;
+    const { view, colour, t } = this;
     for (const input of this.bounds) input.hidden = this.range !== "typed";
     view.setColours(colour ? "values" : "kind");
     view.setFilled(this.filling.checked);
     if (!colour) this.#kindScale();
     else {
-      const values = Float32Array.from({ length: run.count }, (_, row) => colour.at(row, t));
-      const [low, high] = this.#bounds(values), signed = low < 0 && high > 0;
+      const values = this.#valuesAt(t);
+      const scale = this.#scaleOf(values);
       view.setValues(values);
-      view.setRange(low, high, signed);
-      const bar = make("span", { className: "bar" });
-      bar.style.background = gradient(signed);
-      const words = `${colour.meaning}${colour.units ? ` (${colour.units})` : ""}`;
-      this.scale.replaceChildren(make("span", {}, short(low)), bar, make("span", {}, short(high)),
-        make("span", { className: "means" }, words));
+      view.setScale(scale);
+      this.scale.replaceChildren(...legend(scale, colour));
     }
     view.draw();
   }
@@ -202,38 +204,35 @@ export class LatticePanel {
     }));
   }
 
-  /** The least and the largest value that colours stand for; about zero where there are both. */
-  #bounds(values) {
+  /** The scale of the colours: over the range that is selected, linear or logarithmic. */
+  #scaleOf(values) {
+    const kind = this.scales.value;
     if (this.range === "typed" && this.bounds.every((input) => input.value !== "")) {
-      return this.bounds.map((input) => Number(input.value));
+      return scaleOf(this.bounds.map((input) => Number(input.value)), kind);
     }
-    const found = this.range === "now" ? about(extremes(values)) : (this.whole ??= this.#ofAll());
-    this.bounds.forEach((input, end) => { input.value = Number(found[end].toPrecision(4)); });
-    return found;
+    const limits = this.range === "each" ? widen(none(), values) : (this.whole ??= this.#ofAll());
+    const scale = scaleOf(symmetric(limits), kind);
+    this.bounds.forEach((input, end) => {
+      input.value = Number([scale.low, scale.high][end].toPrecision(4));
+    });
+    return scale;
+  }
+
+  /** Whether the values of the last step would take a small part of the scale of all steps. */
+  #hasDecayed() {
+    const width = (limits) => { const { low, high } = scaleOf(symmetric(limits)); return high - low; };
+    const last = widen(none(), this.#valuesAt(this.run.times.length - 1));
+    return width(last) < SMALL_PART * width(this.#ofAll());
   }
 
   #ofAll() {
-    const { colour, run } = this, found = [Infinity, -Infinity];
-    for (let row = 0; row < run.count; row++) {
-      for (let t = 0; t < run.times.length; t++) widen(found, colour.at(row, t));
-    }
-    return about(found);
+    const limits = none(), { summary } = this.colour;
+    if (summary) return widen(widen(limits, summary.least), summary.largest);
+    for (let t = 0; t < this.run.times.length; t++) widen(limits, this.#valuesAt(t));
+    return limits;
   }
-}
 
-function widen(found, value) {
-  if (value < found[0]) found[0] = value;
-  if (value > found[1]) found[1] = value;
-}
-
-function extremes(values) {
-  const found = [Infinity, -Infinity];
-  for (const value of values) widen(found, value);
-  return found;
-}
-
-function about([low, high]) {
-  if (!(low <= high)) return [0, 1];
-  const most = Math.max(-low, high);
-  return low < 0 && high > 0 ? [-most, most] : [low, high];
+  #valuesAt(t) {
+    return Float32Array.from({ length: this.run.count }, (_, row) => this.colour.at(row, t));
+  }
 }

@@ -1,6 +1,6 @@
 /** The page of a run or of a sweep, made of the content that stands in it. */
 
-import { Chart, short } from "./chart.js";
+import { Chart, FEW, short } from "./chart.js";
 import { make, section, table } from "./dom.js";
 import { LatticePanel } from "./panel.js";
 import { unpacked } from "./packed.js";
@@ -63,7 +63,7 @@ class Curves {
       this.#add(place, { ...options, pick: run && ((n) => pick(nearest(run.times, steps[n]))) }, steps);
     }
     for (const { meaning: title, units: yLabel, summary } of run?.colours ?? []) {
-      if (summary?.mean.length !== run.times.length || run.times.length < 3) continue;
+      if (summary?.mean.length !== run.times.length || run.times.length <= FEW) continue;
       this.#add(place, { title, x: run.times, yLabel, series: series(summary), pick }, run.times);
     }
   }
@@ -72,7 +72,18 @@ class Curves {
     for (const { chart, steps } of this.charts) chart.setNow(nearest(steps, this.run.times[t]));
   }
 
-  #add(place, options, steps) { this.charts.push({ chart: new Chart(place, options), steps }); }
+  #add(place, options, steps) {
+    if (options.x.length > FEW) this.charts.push({ chart: new Chart(place, options), steps });
+    else if (options.xLabel === "step") place.append(numbersOf(options, steps)); // no pair of these
+  }
+}
+
+/** The values of a curve of few points as a table, with a column for each step. */
+function numbersOf({ title, yLabel, series }, steps) {
+  const head = ["", ...[...steps].map((step) => `step ${step}`)];
+  const rows = series.map(({ name, values }) => [name, ...[...values].map((value) => short(value))]);
+  const caption = make("figcaption", {}, make("strong", {}, title), yLabel ? `(${yLabel})` : "");
+  return make("figure", {}, caption, table(head, rows));
 }
 
 function nearest(steps, wanted) {

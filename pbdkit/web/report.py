@@ -34,7 +34,7 @@ from pbdkit.io.physical import TWIN_OF
 from pbdkit.lattice.raster import FOLLOWER, FRAME, LEADER
 from pbdkit.model.experiment import Experiment
 from pbdkit.model.reading import Source, yaml_text
-from pbdkit.plotting.data import cells_of, distance_from, lattice_unit, shape_of, triangles_of
+from pbdkit.plotting.data import cell_triangles, distance_from, lattice_unit, shape_of, triangles_of
 from pbdkit.plotting.style import MAX_TEXT, in_its_units, signed
 from pbdkit.plugin.discovery import retired_parts
 from pbdkit.plugin.fracture_model import breaking_order
@@ -587,9 +587,7 @@ def _triangles(reference: Array, sites: list[Array], body: NDArray[np.bool_]) ->
     rows = np.flatnonzero(body & np.isfinite(reference).all(axis=1))
     if not sites:
         return np.asarray(rows[triangles_of(reference[rows])])
-    cells = cells_of(np.stack(sites, axis=1)[rows], reference[rows])
-    halves = cells[cells[:, 2] != cells[:, 3]][:, [0, 2, 3]]
-    return np.asarray(rows[np.concatenate([cells[:, :3], halves])])
+    return np.asarray(rows[cell_triangles(np.stack(sites, axis=1)[rows], reference[rows])])
 
 
 KeyPath = tuple[str | int, ...]

@@ -95,10 +95,10 @@ class CutBond(Strict):
 
 
 class Colour(Strict):
-    """Select the variable that determines the colours of the particles."""
+    """Select the field that determines the colours of the particles, by its name."""
 
     do: Literal["colour"]
-    by: Literal["kind", "displacement", "last-step"]
+    by: Annotated[str, Field(max_length=200)]
 
 
 class Save(Strict):
@@ -168,7 +168,7 @@ def execute(session: Session, command: Command) -> None:
         case CutBond():
             session.cut_bond(command.row)
         case Colour():
-            session.camera.colour = command.by
+            session.colour(command.by)
         case Save():
             session.save()
         case PictureReceived():

@@ -3,6 +3,7 @@
 import { KIND_NAMES } from "./colours.js";
 
 const AXES = ["x", "y"];
+const TELLING = /^(pe[12]|.*(strain|lagrange|stress|kirchhoff|damage|broken|wear))/;
 
 export class Run {
   /** `lattice` and `bonds` as pages hold them, unpacked. */
@@ -67,6 +68,19 @@ export class Run {
       } else yield { ...variable, at: (row, t) => values[row * steps + time(t)] };
     }
     if (this.bonds?.broken) yield this.#firstBroken();
+  }
+
+  /**
+   * The field that tells most: the first of energy, strain, stress or damage that varies, else the
+   * displacement, else null.
+   */
+  telling() {
+    const varies = ({ summary }) => {
+      const low = Math.min(...summary?.least ?? [0]), high = Math.max(...summary?.largest ?? [0]);
+      return high > low;
+    };
+    return this.colours.find((colour) => TELLING.test(colour.name) && varies(colour)) ??
+      this.colours.find((colour) => colour.name === "u" && varies(colour)) ?? null;
   }
 
   *#vector({ name, meaning, units, summary }, at) {

@@ -24,8 +24,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial import KDTree
 
-from pbdkit.array_types import Floats
-from pbdkit.errors import ExperimentError, PbdkitError
+from pbdkit.array_types import Array, Floats
+from pbdkit.errors import ExperimentError, PbdkitError, did_you_mean
 from pbdkit.lattice.raster import FRAME
 from pbdkit.model.experiment import Experiment
 from pbdkit.plugin.fracture_model import Segment
@@ -38,7 +38,7 @@ from pbdkit.stepping.engine_choice import Choice, choose, make_engine
 from pbdkit.stepping.numpy_engine import Engine
 from pbdkit.stepping.state import State, initial_state, unmoved_state
 from pbdkit.web.script import NEVER, Displacement, LeaderScript, Saved, Script, save_script
-from pbdkit.web.view_frames import COLOURS, Camera, ViewFrame
+from pbdkit.web.view_frames import KIND, Camera, ViewFrame
 
 MAX_PARTICLES = 4000
 """Maximum number of particles for which the spectrum is computed in about a second."""
@@ -393,7 +393,8 @@ class Session:
         self.stage = LiveStepper(self.script, scene)
         self.state = self.stage.set(initial_state(scene))
         self.end, self.guard = 0, Guard.of(scene, self.state)
-        self.camera, self.history = Camera(self.stage.scene), History(self.state)
+        self.camera = Camera(self.stage.scene, self.experiment.diagnostics)
+        self.history = History(self.state)
 
     @property
     def step(self) -> int:
@@ -502,9 +503,23 @@ class Session:
         )
         return result
 
+    def colour(self, name: str) -> None:
+        """Select the field that determines the colours, or the kinds of particles."""
+        if name not in (KIND, *self.camera.fields.labels):
+            names = self.camera.fields.labels
+            raise ExperimentError(f"there is no field '{name}'{did_you_mean(name, names)}")
+        self.camera.colour = name
+
     def frame(self) -> ViewFrame:
-        """Return a picture of the current state."""
-        return self.camera.frame(self.stage.scene, self.state, self.end, self.pictures, self.step_s)
+        """Return a picture of the current state. If its field cannot be computed, an error is
+        reported, and particles are coloured by their kinds."""
+        now = self.stage.scene, self.state, self.end, self.pictures, self.step_s
+        try:
+            return self.camera.frame(*now)
+        except PbdkitError as error:
+            self.camera.colour = KIND
+            self.notify({"is": "error", "text": str(error)})
+            return self.camera.frame(*now)
 
     def plain(self) -> Experiment:
         """Return the experiment with the current values of its parameters."""
@@ -598,7 +613,7 @@ Message = dict[str, Any]
 
 def static_message(session: Session) -> Message:
     """Return the content of a session that is constant: the body, its bonds (pairs of rows, with 32
-    bits each), and the names and ranges of its adjustable numbers."""
+    bits each) and triangles, its fields, and the names and ranges of its adjustable numbers."""
     camera, scene = session.camera, session.stage.scene
     return {
         "is": "scene",
@@ -607,12 +622,18 @@ def static_message(session: Session) -> Message:
         "count": len(camera.rows),
         "every": camera.every,
         "spacing": camera.spacing,
-        "bonds": b64encode(camera.bonds.astype("<u4").tobytes()).decode(),
-        "colours": COLOURS,
+        "bonds": _as_text(camera.bonds, "<u4"),
+        "triangles": _as_text(camera.triangles, "<u4"),
+        "beyond": _as_text(camera.beyond, "<f4"),
+        "fields": camera.fields.labels,
         "numbers": [
             {"name": number.name, "span": number.span} for number in session.script.numbers.values()
         ],
     }
+
+
+def _as_text(array: Array, dtype: str) -> str:
+    return b64encode(array.astype(dtype).tobytes()).decode()
 
 
 def status_message(session: Session) -> Message:

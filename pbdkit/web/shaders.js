@@ -46,7 +46,10 @@ void main() {
     if (shape == 1 && size > 6.0) {
       colour.rgb = mix(colour.rgb * 0.45, colour.rgb, clamp(inside - width + 0.5, 0.0, 1.0));
     }
-    if (shape == 2) colour.a *= clamp(3.0 - inside, 0.0, 1.0);
+    if (shape == 2) { // a dark ring between two white ones, seen on dark and on white
+      colour.rgb = mix(colour.rgb, vec3(1.0), clamp(abs(inside - 3.0) - 0.8, 0.0, 1.0));
+      colour.a *= clamp(6.0 - inside, 0.0, 1.0);
+    }
     colour.a *= clamp(inside, 0.0, 1.0);
   }
 }`;

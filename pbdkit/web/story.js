@@ -1,6 +1,6 @@
 /** Details of the selected particle or bond. */
 
-import { Chart, short } from "./chart.js";
+import { Chart, FEW, short } from "./chart.js";
 import { make, table } from "./dom.js";
 
 /** Details of a particle: values at the current step, and histories. */
@@ -16,8 +16,10 @@ export class ParticleStory {
       name: `u_${name}`, values: run.history((t) => run.u(row, axis, t)),
     }));
     const shown = { x: run.times, yLabel: length, pick };
-    this.charts = [new Chart(place, { title: "displacement", series, ...shown })];
-    if (colour && !/^u(_[xy])?$/.test(colour.name) && run.times.length > 1) {
+    this.charts = [];
+    if (run.times.length <= FEW) return; // the table holds all
+    this.charts.push(new Chart(place, { title: "displacement", series, ...shown }));
+    if (colour && !/^u(_[xy])?$/.test(colour.name)) {
       const values = run.history((t) => colour.at(row, t));
       const told = { title: colour.meaning, series: [{ name: "", values }] };
       this.charts.push(new Chart(place, { ...shown, ...told, yLabel: colour.units }));
@@ -42,10 +44,11 @@ export class BondStory {
     if (Number.isFinite(limit)) series.push({ name: "breaks above", values: values.map(() => limit) });
     const words = [...told(run, bond, values, limit)].map((line) => make("li", {}, line));
     place.replaceChildren(make("h3", {}, `Bond ${run.bondName(bond)}`), make("ul", {}, ...words));
-    this.chart = new Chart(place, { title: "strain", x: run.times, series, pick });
+    this.chart = run.times.length > FEW
+      ? new Chart(place, { title: "strain", x: run.times, series, pick }) : null;
   }
 
-  setStep(t) { this.chart.setNow(t); }
+  setStep(t) { this.chart?.setNow(t); }
 }
 
 function* told(run, bond, strains, limit) {

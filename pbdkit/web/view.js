@@ -2,6 +2,7 @@
 
 import { KINDS, UNKNOWN, mapped, rgb } from "./colours.js";
 import { listenToPointers } from "./pointers.js";
+import { levelOf, scaleOf } from "./scale.js";
 import { FRAGMENT, UNIFORMS, VERTEX } from "./shaders.js";
 
 const LINE = [0.62, 0.62, 0.62, 1];
@@ -23,7 +24,7 @@ export class LatticeView {
     this.kinds = new Uint8Array(count).fill(1);
     this.values = null;
     this.broken = new Uint8Array(bonds.length / 2);
-    this.range = [0, 1, false];
+    this.scaleOfValues = scaleOf([0, 1]);
     this.by = "kind";
     this.fills = true;
     this.selected = { particle: -1, bond: -1 };
@@ -42,8 +43,9 @@ export class LatticeView {
 
   setPositions(positions) { this.positions = positions; this.stale.add("positions"); }
   setValues(values) { this.values = values; this.stale.add("values"); }
-  setRange(low, high, diverging = false) {
-    this.range = [low, high, diverging];
+  /** Sets the scale of values, see `scaleOf`. */
+  setScale(scale) {
+    this.scaleOfValues = scale;
     this.stale.add("values").add("map");
   }
   setKinds(kinds) { this.kinds = kinds; this.stale.add("kinds"); }
@@ -153,7 +155,8 @@ export class LatticeView {
     const look = coloured ? 2 : 1, shape = size > 3 ? 1 : 0;
     if (!filled) this.#elements(gl.POINTS, "order", { look, shape, size });
     else if (apart > 8) this.#elements(gl.POINTS, "order", { shape, size: 0.35 * size, one: DOT });
-    this.#marks(Math.max(size, 5 * ratio) + 6 * ratio);
+    if (filled) this.#elements(gl.POINTS, "apart", { look, shape, size });
+    this.#marks(Math.max(size, 5 * ratio) + 12 * ratio);
   }
 
   /** Takes the view off its canvas. */
@@ -235,14 +238,19 @@ export class LatticeView {
     }
     if (stale.has("values")) this.#attribute(1, "levels", this.#levels(), 1);
     if (stale.has("map")) {
-      const bytes = mapped(this.range[2], 256);
+      const bytes = mapped(this.scaleOfValues.signed, 256);
       gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, 256, 1, 0, gl.RGBA, gl.UNSIGNED_BYTE, bytes);
     }
     if (stale.has("bonds")) {
       this.#indices("whole", this.#endsOf(inOrder(this.broken, [WHOLE])));
       this.#indices("broken", this.#endsOf(inOrder(this.broken, [BROKEN])));
     }
-    if (stale.has("triangles") && this.triangles) this.#indices("triangles", this.triangles);
+    if (stale.has("triangles") && this.triangles) {
+      this.#indices("triangles", this.triangles);
+      const within = new Uint8Array(this.count);
+      for (const row of this.triangles) within[row] = 1;
+      this.#indices("apart", inOrder(within, [0])); // no triangle shows their values
+    }
     stale.clear();
   }
 
@@ -254,12 +262,11 @@ export class LatticeView {
 
   /** Values from 0 to 1 along the colour map; -1 where there is none. */
   #levels() {
-    const levels = new Float32Array(this.count), [low, high] = this.range;
+    const levels = new Float32Array(this.count);
     if (!this.values) return levels;
-    const factor = high > low ? 1 / (high - low) : 0;
     for (let n = 0; n < this.count; n++) {
-      const level = factor ? (this.values[n] - low) * factor : 0.5;
-      levels[n] = Number.isNaN(this.values[n]) ? -1 : Math.min(Math.max(level, 0), 1);
+      const level = levelOf(this.values[n], this.scaleOfValues);
+      levels[n] = Number.isNaN(level) ? -1 : level;
     }
     if (this.beyond && this.fills) this.#fillBeyond(levels);
     return levels;

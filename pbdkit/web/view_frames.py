@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from operator import is_
@@ -14,9 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.array_types import Bytes
+from pbdkit.io.snapshot import Tables
+from pbdkit.lattice.raster import FRAME
+from pbdkit.model.bodies import Sites
+from pbdkit.plotting.data import cell_triangles
+from pbdkit.plugin import Diagnostic
 from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
+from pbdkit.web.live_fields import FieldEvaluator
 
 MAX_POINTS = 50_000
 """Maximum number of particles that are shown."""
@@ -24,8 +31,8 @@ MAX_LEADERS = 2000
 """Maximum number of leaders of a group that are shown."""
 MAX_BONDS = 500_000
 """Maximum number of bonds that are shown."""
-COLOURS = {"kind": "kind", "displacement": "displacement", "last-step": "move in the last step"}
-"""Variables that can colour particles, with their names."""
+KIND = "kind"
+"""Name of the colours by the kinds of particles."""
 HEAD = struct.Struct("<IIIIIIIIdd")
 """Layout of the head of a frame."""
 VALUES = 1
@@ -78,11 +85,12 @@ class Camera:
     """Builder of frames from states of a body.
 
     For large bodies every n-th particle along both axes is shown, with n = `every`. The last
-    particles along the axes and leaders are shown, too. `rows` are the shown particles, and
+    particles along the axes and leaders are shown, too. The `diagnostics` of the experiment, and
+    others, provide the fields that determine colours. `rows` are the shown particles, and
     `spacing` is their distance at rest.
     """
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(self, scene: Scene, diagnostics: Sequence[Diagnostic] = ()) -> None:
         raster = scene.raster
         self.every = max(1, math.ceil(math.sqrt(raster.count / MAX_POINTS)))
         self.rows = np.arange(raster.count)
@@ -90,7 +98,8 @@ class Camera:
             self.rows = _thinned(scene, self.every)
         self.reference = raster.reference(self.rows)
         self.spacing = min(map(min, scene.neighbourhood.shells())) * self.every
-        self.colour = "kind"
+        self.colour = KIND
+        self.fields = FieldEvaluator(scene, diagnostics)
         self._scene, self._place = scene, raster.place_of(self.rows)
         self._leading: list[Any] = []
         self._kinds = self._broken = np.zeros(0, np.uint8)
@@ -101,6 +110,26 @@ class Camera:
         omitted."""
         table = self._scene.bonds.ends if self._shows_bonds else np.zeros((0, 2))
         return table.astype(np.uint32) if len(table) <= MAX_BONDS else np.zeros((0, 2), np.uint32)
+
+    @cached_property
+    def triangles(self) -> NDArray[np.uint32]:
+        """Rows of the corners of the triangles that fields fill, (triangle, corner). The array is
+        empty if particles are omitted or neighbours are re-evaluated."""
+        raster, rows = self._scene.raster, np.flatnonzero(self._scene.raster.table_kind != FRAME)
+        if not self._shows_bonds or len(rows) < 3:
+            return np.zeros((0, 3), np.uint32)
+        triangles = cell_triangles(raster.site_table()[rows], self.reference[rows])
+        return rows[triangles].astype(np.uint32)
+
+    @cached_property
+    def beyond(self) -> NDArray[np.float32]:
+        """Signed distance of the particles from the outline, negative inside. The array is empty if
+        the outline cuts no cells."""
+        tables, body = Tables(self._scene), self._scene.experiment.body
+        if not self._shows_bonds or (tables.inside == tables.body).all():
+            return np.zeros(0, np.float32)
+        places = Sites(tuple(self._scene.raster.site_table().T), tuple(self.reference.T))
+        return np.asarray(body.distance(places), np.float32)
 
     @property
     def _shows_bonds(self) -> bool:
@@ -118,16 +147,14 @@ class Camera:
         # In a diverging run, displacements may be too large for single precision.
         with np.errstate(over="ignore"):
             positions = self.positions(state).astype(np.float32)
-            values = self._values(state)
+            values = self._values(scene, state)
         kinds, broken = self._kinds_of(scene, state.step), self._broken_of(state)
         return ViewFrame(state.step, end, pictures, step_s, positions, values, kinds, broken)
 
-    def _values(self, state: State) -> NDArray[np.float32] | None:
-        if self.colour == "kind":
+    def _values(self, scene: Scene, state: State) -> NDArray[np.float32] | None:
+        if self.colour == KIND:
             return None
-        u = state.u if self.colour == "displacement" else state.u - state.previous
-        displacements = u.reshape(len(u), -1)[:, self._place]
-        return np.asarray(np.sqrt((displacements.astype(np.float64) ** 2).sum(axis=0)), np.float32)
+        return self.fields.values(self.colour, scene, state)[self.rows].astype(np.float32)
 
     def _kinds_of(self, scene: Scene, step: int) -> Bytes:
         leading = [group.rows for group in scene.leading if group.group.leads(step + 1)]
@@ -161,8 +188,6 @@ def _thinned(scene: Scene, every: int) -> NDArray[np.intp]:
 
 
 def _range(values: NDArray[np.float32] | None) -> tuple[float, float]:
-    if values is None or not len(values):
-        return 0.0, 1.0
-    finite = values[np.isfinite(values)]
-    high = float(finite.max(initial=0.0))
-    return 0.0, high if high > 0.0 else 1.0
+    """Return the least and the largest finite value, 0 and 1 if there is none."""
+    finite = np.zeros(0) if values is None else values[np.isfinite(values)]
+    return (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)

@@ -216,9 +216,10 @@ def test_colours_and_their_range(page, sheet):
     dataset, path = sheet
     opened(page, path)
     page.get_by_label("Colour").select_option("u_x")
+    page.get_by_label("Range").select_option("all")
     most = float(abs(dataset.position - dataset.reference).sel(axis="x").max())
     assert page.locator(".scale").inner_text().split()[1] == f"{most:.4g}"
-    page.get_by_label("Range").select_option("now")
+    page.get_by_label("Range").select_option("each")
     now = (dataset.position - dataset.reference).isel(time=-1).sel(axis="x")
     assert page.locator(".scale").inner_text().split()[1] == f"{float(now.max()):.4g}"
     page.get_by_label("Range").select_option("typed")
@@ -229,12 +230,36 @@ def test_colours_and_their_range(page, sheet):
     assert page.locator("canvas").screenshot() != before
 
 
-@pytest.mark.parametrize("width", [1280, 400])
+@pytest.mark.parametrize("width", [1280, 390])
 def test_nothing_is_wider_than_the_window(page, torn, width):
     page.set_viewport_size({"width": width, "height": 900})
     opened(page, torn[1])
     click_at(page, torn[0], torn[0].position.values[-1, 60])
     assert page.evaluate("document.documentElement.scrollWidth") <= width
+
+
+def test_a_decayed_field_opens_at_the_range_of_its_step(page, sheet):
+    """PE1 is 3.9 in step 10 and 4e-4 in the last step."""
+    dataset, path = sheet
+    opened(page, path)
+    assert page.get_by_label("Colour").input_value() == "pe1"
+    assert page.get_by_label("Range").input_value() == "each"
+    each = dataset.pe1.isel(time=-1)
+    assert page.locator(".scale").inner_text().split()[1] == short(each.max())
+    page.get_by_label("Range").select_option("all")
+    assert page.locator(".scale").inner_text().split()[1] == short(dataset.pe1.max())
+    linear = page.locator("canvas").screenshot()
+    page.get_by_label("Scale").select_option("log")
+    assert page.locator(".scale").inner_text().split()[:2] == ["≤", short(dataset.pe1.max() * 1e-4)]
+    assert page.locator("canvas").screenshot() != linear
+
+
+def short(value):
+    return (
+        np.format_float_scientific(value, 3, trim="-").replace("e-0", "e-")
+        if value < 1e-3
+        else f"{value:.4g}"
+    )
 
 
 def test_predicted_and_measured_spectral_radius(page, sheet):
@@ -338,8 +363,9 @@ def test_texts_of_the_file_are_escaped(page, sheet, tmp_path):
 def test_equilibrium_and_its_error_bound(page, tmp_path):
     dataset = pbdkit.run("modelling/inclusion", progress=False)
     opened(page, written(dataset, tmp_path))
-    page.get_by_label("Colour").select_option("stress_xx")
+    assert page.get_by_label("Colour").input_value() == "stress_xx"
     assert page.get_by_label("Fill").is_checked()
+    assert page.locator(".chart").count() == 0  # of two points
     before = page.locator("canvas").screenshot()
     page.get_by_label("Displacement factor").fill("20")
     page.get_by_label("Displacement factor").press("Enter")
@@ -350,6 +376,7 @@ def test_equilibrium_and_its_error_bound(page, tmp_path):
     page.get_by_label("Find").press("Enter")
     told = float(dataset.stress_xx.sel(particle=100).isel(time=-1))
     assert number_beside(page, "stress_xx") == pytest.approx(told, rel=1e-5)
+    assert page.locator(".chart").count() == 0
 
 
 def test_benchmarks_and_scenes_that_cannot_be_built(page, sheet, tmp_path):

@@ -12,6 +12,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from socket import create_connection
+from typing import ClassVar, Literal
 from urllib.parse import urlsplit
 
 import numpy as np
@@ -22,8 +23,11 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 import pbdkit
+from pbdkit.io.physical import in_physical_units
 from pbdkit.lattice.raster import FOLLOWER
 from pbdkit.model.shipped import shipped_names
+from pbdkit.plotting.style import signed
+from pbdkit.plugin import Variable
 from pbdkit.scene.scene import build_scene
 from pbdkit.simulation import Simulation
 from pbdkit.web import script as saving, session as history, session as stage
@@ -132,6 +136,68 @@ def test_kernels_reproduce_the_session(interpreted, tmp_path, monkeypatch):
     at_random(session, 3)
     do(session, do="save")
     assert_same(session.state, run_of(tmp_path / "made.yaml"))
+
+
+@pytest.mark.parametrize("name", ["paper/f2", "modelling/composite-plate"])
+def test_fields_equal_the_variables_of_a_run_in_the_units_of_the_user(name, tmp_path):
+    session, _ = session_of(name, tmp_path)
+    session.advance(7)
+    do(session, do="save")
+    dataset = in_physical_units(pbdkit.run(tmp_path / "made.yaml", progress=False)).isel(time=-1)
+    compared = set()
+    for field, label in session.camera.fields.labels.items():
+        if field not in dataset or dataset[field].dims != ("particle",):
+            continue
+        do(session, do="colour", by=field)
+        expected = dataset[field].values.astype(np.float32)
+        np.testing.assert_allclose(session.frame().values, expected, rtol=1e-6)
+        assert label["units"] == signed(dataset[field].units)
+        compared.add(field)
+    assert compared & {"pe1", "stress_von_mises", "strain_xx"}
+
+
+class Failing(pbdkit.Diagnostic):
+    """A value for each particle that cannot be computed after step 3."""
+
+    type: Literal["failing"] = "failing"
+    measured: ClassVar[list[int]] = []
+
+    def variables(self):
+        return (Variable("failing", ("particle",), "a value", "1"),)
+
+    def measure(self, now):
+        self.measured.append(now.step)
+        return (now.reference()[:, 0] * (1 / (3 - now.step)),)
+
+
+def test_a_field_is_computed_only_while_it_is_selected(tmp_path):
+    said = []
+    parts = ["diagnostics=[{type: failing}]"]
+    loaded = pbdkit.load("paper/a", settings=parts, components=[Failing])
+    session = Session(loaded, tmp_path / "made.yaml", notify=said.append)
+    session.advance(1)
+    session.frame()
+    assert Failing.measured == []
+    do(session, do="colour", by="failing")
+    assert session.frame().values.max() == session.camera.reference[:, 0].max() / 2
+    with pytest.raises(pbdkit.ExperimentError, match="there is no field 'stres_xx'; did you mean"):
+        do(session, do="colour", by="stres_xx")
+    session.advance(2)
+    assert session.frame().values is None
+    assert session.camera.colour == "kind"
+    assert "ZeroDivisionError" in said[-1]["text"]
+    assert "failing" in said[-1]["text"]
+
+
+def test_bonds_give_particles_the_fraction_that_is_broken(tmp_path):
+    session, _ = session_of("paper/a", tmp_path)
+    do(session, do="cut-bond", row=0)
+    session.advance(1)
+    do(session, do="colour", by="broken")
+    ends, values = session.camera.bonds, session.frame().values
+    bonds_of = [(ends == row).any(axis=1).sum() for row in ends[0]]
+    np.testing.assert_allclose(values[ends[0]], 1 / np.array(bonds_of), rtol=1e-6)
+    assert np.nansum(values) == pytest.approx(values[ends[0]].sum())
 
 
 def test_rewinding_gives_the_same_states(tmp_path):
@@ -782,6 +848,38 @@ def test_page_in_a_browser_drags_changes_cuts_and_saves(page, tmp_path):
     session.rewind(steps)
     assert session.step == steps
     assert_same(session.state, run_of(tmp_path / "made.yaml"))
+
+
+def test_page_on_a_phone_shows_the_body_above_the_controls(page, tmp_path):
+    page.set_viewport_size({"width": 390, "height": 844})
+    session, _ = session_of("paper/d1", tmp_path)
+    with served(session) as address:
+        page.goto(address)
+        until_page(page, "globalThis.pbdkitLive?.received >= 1 && pbdkitLive.step === 0")
+        assert page.evaluate("pbdkitLive.canvas.clientWidth") == 390
+        page.get_by_label("Colour").select_option("strain_xx")
+        page.get_by_role("button", name="Step", exact=True).click()
+        until_page(page, "pbdkitLive.step === 1 && pbdkitLive.picture.values")
+        until_page(page, "document.querySelector('.means')?.textContent.startsWith('small strain')")
+        assert page.evaluate("document.documentElement.scrollWidth") == 390
+        page.evaluate("scrollTo(0, 0)")
+        inside = f"""row => {{ const [x, y] = ({PLACE})(row);
+          return x > 0 && x < 390 && y > 0 && y < 844 * 0.55; }}"""
+        assert all(page.evaluate(inside, row) for row in (0, 60))
+        page.evaluate("pbdkitLive.view.pan(600, 0)")
+        assert not page.evaluate(inside, 60)
+        page.get_by_role("button", name="Fit view").click()
+        until_page(page, f"({inside})(60)")
+        follower = int(np.flatnonzero(session.frame().kinds == FOLLOWER)[20])
+        page.mouse.move(*page.evaluate(PLACE, follower))
+        assert page.evaluate("pbdkitLive.view.selected.particle") == follower
+        page.mouse.down()
+        until(lambda: session.grabbed is not None)
+        assert session.grabbed.row == follower
+        page.mouse.up()
+        page.mouse.move(3, 3)
+        assert page.evaluate("pbdkitLive.view.selected.particle") == -1
+        page.goto("about:blank")
 
 
 def leads_to(page, row, by):
