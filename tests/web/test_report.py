@@ -255,11 +255,7 @@ def test_a_decayed_field_opens_at_the_range_of_its_step(page, sheet):
 
 
 def short(value):
-    return (
-        np.format_float_scientific(value, 3, trim="-").replace("e-0", "e-")
-        if value < 1e-3
-        else f"{value:.4g}"
-    )
+    return f"{value:.4g}" if value >= 1e-3 else f"{value:.3e}".replace("e-0", "e-")
 
 
 def test_predicted_and_measured_spectral_radius(page, sheet):
