@@ -94,7 +94,7 @@ def something(page, dice):
         page.mouse.wheel(0, dice.choice([-120, 120]))
         page.keyboard.press("f")
     elif kind == "colour":
-        page.locator("aside select").select_option(dice.choice(["kind", "displacement"]))
+        page.get_by_label("Colour").select_option(dice.choice(["kind", "u", "pe1", "strain_xx"]))
     else:
         names = {"rewind": "step to go back to", "speed": "speed"}
         name = names.get(kind) or "solver.relaxation"
