@@ -204,8 +204,9 @@ def comments_of(module: str) -> dict[tuple[str, str], list[str]]:
 def comment_of(name: str, value: Any) -> str:
     """Return the docstring of a constant."""
     for module in sorted(m for m in sys.modules if m.startswith("pbdkit.")):
-        comment = comments_of(module).get(("", name))
-        if comment and vars(sys.modules[module]).get(name) is value:
+        # Parsing takes time, so that only modules with the constant are parsed.
+        is_there = vars(sys.modules[module]).get(name) is value
+        if is_there and (comment := comments_of(module).get(("", name))):
             return "\n".join(comment)
     raise LookupError(f"{name} has no docstring")
 

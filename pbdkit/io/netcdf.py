@@ -125,8 +125,8 @@ class NetcdfFile:
                 file.close()
 
     def _open(self, mode: str) -> None:
-        h5py, h5netcdf = import_module("h5py"), import_module("h5netcdf")
-        self._h5 = h5py.File(self.file, mode, track_order=True)
+        hdf5_file, h5netcdf = import_module("pbdkit.io.hdf5_file"), import_module("h5netcdf")
+        self._h5 = hdf5_file.Hdf5File(self.file, mode, track_order=True)
         self._content = h5netcdf.File(self._h5, mode)
 
     def _define(self, column: Column, sizes: Mapping[str, int], planned: Mapping[str, int]) -> None:

@@ -61,8 +61,9 @@ def save(dataset: xarray.Dataset, path: str | Path, *, force: bool = False) -> P
 def write_dataset(dataset: xarray.Dataset, path: Path, *, replace: bool) -> None:
     """Write a dataset as a sealed file, which appears complete or not at all. Raises WriteError."""
     import h5netcdf
-    import h5py
     from xarray.backends import H5NetCDFStore
+
+    from pbdkit.io.hdf5_file import Hdf5File
 
     plain = dataset.drop_encoding()
     for name, variable in dataset.variables.items():
@@ -70,7 +71,7 @@ def write_dataset(dataset: xarray.Dataset, path: Path, *, replace: bool) -> None
             plain[name].encoding["zlib"] = True
     with (
         open_atomic(path, PagedFile, replace=replace) as file,
-        h5py.File(file, "w", track_order=True) as content,
+        Hdf5File(file, "w", track_order=True) as content,
         h5netcdf.File(content, "w") as target,
     ):
         plain.dump_to_store(H5NetCDFStore(target, autoclose=False))

@@ -210,9 +210,10 @@ def open_content(file: io.RawIOBase) -> Any:
     """Open the netCDF-4 content of a Python file object as an h5netcdf.File. Raises StorageError
     for declarations or references that are not acceptable."""
     import h5netcdf
-    import h5py
 
-    content = h5py.File(file, "r")
+    from pbdkit.io.hdf5_file import Hdf5File
+
+    content = Hdf5File(file, "r")
     try:
         check_declared(content, file.seek(0, os.SEEK_END))
     except BaseException:
