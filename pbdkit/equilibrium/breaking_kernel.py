@@ -38,7 +38,7 @@ from pbdkit.scene.constants import Owner
 from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.memory_estimate import LARGEST_REPEATED
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.engine_choice import PATIENCE_S, obstacle
+from pbdkit.stepping.engine_choice import obstacle
 from pbdkit.stepping.frame_following import FollowFrame
 from pbdkit.stepping.kernel import Function
 from pbdkit.stepping.leaders import place, prescribe
@@ -187,6 +187,9 @@ def norm(table: Any) -> Any:
     return math.sqrt(squares)
 
 
+COMPILING_S = 10.0
+"""If numpy is estimated to need more than this time, in seconds, the kernel is compiled. Compiling
+takes 20 s of processor time at the first use."""
 EQUILIBRIUM_S = 6e-3
 """Estimated time of one equilibrium by numpy, in seconds."""
 PARTICLE_S = 1e-5
@@ -208,7 +211,7 @@ def breaking_kernel_of(scene: Scene, tolerance: float, watch: Watch) -> Breaking
     direct = solver.method == "lu" or (
         solver.method == "auto" and scene.raster.count <= LARGEST_REPEATED
     )
-    if not (direct and _is_plain(scene)) or _seconds(scene) < PATIENCE_S or obstacle():
+    if not (direct and _is_plain(scene)) or _seconds(scene) < COMPILING_S or obstacle():
         return None
 
     try:

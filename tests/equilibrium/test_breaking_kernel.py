@@ -57,7 +57,7 @@ def _mostly_interpreted(request):
 
 def by_kernel(monkeypatch):
     """Count the increments that the kernel solves, each time."""
-    monkeypatch.setattr(choice, "PATIENCE_S", 0.0)
+    monkeypatch.setattr(choice, "COMPILING_S", 0.0)
     settled, equilibrate = [], BreakingKernel.equilibrate
     monkeypatch.setattr(
         BreakingKernel,

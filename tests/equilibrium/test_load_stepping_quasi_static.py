@@ -320,7 +320,7 @@ def test_part_on_one_bond_does_not_end_the_test():
 
 def test_shipped_dogbone_has_the_documented_strength(monkeypatch):
     if not AT_LENGTH:  # numpy is done before its kernel is compiled
-        monkeypatch.setattr(breaking_kernel, "PATIENCE_S", math.inf)
+        monkeypatch.setattr(breaking_kernel, "COMPILING_S", math.inf)
     hexagonal = "lattice={type: hexagonal, a: 1.0}", "neighbours={type: coordination, shells: 1}"
     ds = pbdkit.run(pbdkit.load("modelling/dogbone-to-failure", settings=hexagonal), progress=False)
     force = ds.reaction.values[:, 1, 0]

@@ -113,7 +113,7 @@ def started(work: Callable[[], object], log: Path) -> int:
         os._exit(code)
 
 
-def ended(pid: int, patience_s: float = 60.0) -> int:
+def ended(pid: int, patience_s: float = 600.0) -> int:
     """Return the exit status of a process, or minus the signal; one that hangs is killed: -1000."""
     end = time.monotonic() + patience_s
     while time.monotonic() < end:
