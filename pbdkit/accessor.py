@@ -9,7 +9,13 @@ from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 
 import xarray
 
-from pbdkit.io.layout import experiment_of, in_this_layout, indices_of, rows_at
+from pbdkit.io.layout import (
+    experiment_of,
+    in_this_layout,
+    indices_of,
+    rows_at,
+    with_principal_values,
+)
 from pbdkit.io.members import member
 from pbdkit.io.physical import in_physical_units
 from pbdkit.io.save import save
@@ -168,7 +174,8 @@ class PbdAccessor:
         -------
         xarray.Dataset
             Dataset with `position_x` and `position_y` in place of `position`, and likewise for
-            every variable along `axis`.
+            every variable along `axis`. The principal values of `stress_principal` are also in
+            `stress_1`, the larger one, and `stress_2`.
 
         Examples
         --------
@@ -177,13 +184,14 @@ class PbdAccessor:
         """
         parts: dict[str, xarray.Variable] = {}
         labels = []
-        for name, vector in self._dataset.variables.items():
+        dataset = with_principal_values(self._dataset)
+        for name, vector in dataset.variables.items():
             for n in range(vector.sizes.get("axis", 0)) if name != "axis" else ():
-                axis = self._dataset["axis"].values[n]
+                axis = dataset["axis"].values[n]
                 part = parts[f"{name}_{axis}"] = vector.isel(axis=n)
                 part.attrs["long_name"] = f"{part.attrs.get('long_name', name)}, {axis} component"
-                labels += [f"{name}_{axis}"] if name in self._dataset.coords else []
-        return self._dataset.drop_dims("axis", errors="ignore").assign(parts).set_coords(labels)
+                labels += [f"{name}_{axis}"] if name in dataset.coords else []
+        return dataset.drop_dims("axis", errors="ignore").assign(parts).set_coords(labels)
 
     def physical(self) -> xarray.Dataset:
         """Convert the dataset to mm, MPa, N and mJ.

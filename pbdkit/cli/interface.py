@@ -56,6 +56,22 @@ LOOK = [
         default=None,
         help="Limits of the colour scale.",
     ),
+    click.option(
+        "--scale",
+        "norm",
+        type=click.Choice(["linear", "log", "sqrt", "symlog"]),
+        default="linear",
+        show_default=True,
+        help="Scale of the colours.",
+    ),
+    click.option(
+        "--limits",
+        "limits_of",
+        type=click.Choice(["all", "each"]),
+        default="all",
+        show_default=True,
+        help="Limits of the colours of all drawn steps, or of each step.",
+    ),
     click.option("--map", "cmap", metavar="NAME", help="Colour map of matplotlib, e.g. magma."),
     click.option(
         "--size",
@@ -76,9 +92,11 @@ def look_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options that pictures and movies have in common, in the order of the help."""
 
     @wraps(command)
-    def with_limits(*args: Any, limits: tuple[float, float] | None, **more: Any) -> Any:
+    def with_limits(
+        *args: Any, limits: tuple[float, float] | None, limits_of: str, **more: Any
+    ) -> Any:
         vmin, vmax = limits or (None, None)
-        return command(*args, vmin=vmin, vmax=vmax, **more)
+        return command(*args, vmin=vmin, vmax=vmax, limits=limits_of, **more)
 
     for option in reversed(LOOK):
         with_limits = option(with_limits)

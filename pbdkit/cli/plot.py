@@ -62,11 +62,12 @@ def _plot_set_up(
         "vmin": "range",
         "vmax": "range",
         "cmap": "map",
+        "norm": "scale",
     }
     if options := [
         option_names.get(key, key)
         for key, value in look.items()
-        if value not in (None, False, (), {})
+        if value not in (None, False, (), {}, "linear", "all")
     ]:
         raise ExperimentError(
             f"--{options[0]}: applies to results, but {name} is an experiment; "

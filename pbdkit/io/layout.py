@@ -349,6 +349,24 @@ def _described(dataset: xarray.Dataset, new: dict[str, Any]) -> xarray.Dataset:
     return dataset.set_coords([column.name for column in columns if column.coordinate])
 
 
+PRINCIPAL = "_principal"
+"""Ending of the names of variables that contain both principal values of plane tensors."""
+
+
+def with_principal_values(dataset: xarray.Dataset) -> xarray.Dataset:
+    """Return the dataset with a variable for each principal value: `stress_1`, the larger one, and
+    `stress_2`, the smaller one, of `stress_principal`. Values are not read."""
+    new: dict[str, Any] = {}
+    for name, both in dataset.variables.items():
+        if not str(name).endswith(PRINCIPAL) or "principal" not in both.dims:
+            continue
+        for k, size in enumerate(("larger", "smaller")):
+            value = both.isel(principal=k)
+            value.attrs |= {"long_name": f"{size} {both.attrs.get('long_name', name)}"}
+            new.setdefault(f"{str(name).removesuffix(PRINCIPAL)}_{k + 1}", value)
+    return dataset.assign({name: v for name, v in new.items() if name not in dataset.variables})
+
+
 def json_attribute(dataset: xarray.Dataset, attribute: str) -> dict[str, Any]:
     """Return the mapping that an attribute contains as JSON. In one member of a sweep, a scalar
     coordinate replaces the attribute. The result is empty if there is neither. Raises StorageError

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from pbdkit.errors import refuse_no_matplotlib
 from pbdkit.plotting.movie import animate, animation
-from pbdkit.plotting.style import PlotOptions
+from pbdkit.plotting.style import Limits, Norm, PlotOptions
 
 if TYPE_CHECKING:
     import xarray
@@ -40,6 +40,8 @@ def plot(
     vmin: float | None = None,
     vmax: float | None = None,
     cmap: str | None = None,
+    norm: Norm = "linear",
+    limits: Limits = "all",
     figsize: tuple[float, float] | None = None,
     dpi: int = 200,
     ax: Axes | Sequence[Axes] | None = None,
@@ -75,6 +77,12 @@ def plot(
         of both signs occur.
     cmap : str, optional
         Colour map of matplotlib.
+    norm : {"linear", "log", "sqrt", "symlog"}
+        Scale of the colours: linear; logarithmic, over at most four decades; square root, with the
+        sign of the value; or logarithmic on both sides of a linear range around zero.
+    limits : {"all", "each"}
+        "all" gives all steps the same limits of colours. "each" gives each step the limits of its
+        own values, which its title states.
     figsize : (float, float), optional
         Width and height of the figure in inches.
     dpi : int
@@ -101,7 +109,8 @@ def plot(
     >>> figure = ds.pbd.plot("pe1", time=[0, 20])
     """
     look = PlotOptions(
-        filled, contours, bonds, broken, outline, numbers, vmin, vmax, cmap, figsize, dpi
+        filled, contours, bonds, broken, outline, numbers, vmin, vmax, cmap, norm,
+        limits, figsize, dpi,
     )  # fmt: skip
     refuse_no_matplotlib()
     from pbdkit.plotting.configuration import draw
@@ -125,6 +134,8 @@ def compare(
     vmin: float | None = None,
     vmax: float | None = None,
     cmap: str | None = None,
+    norm: Norm = "linear",
+    limits: Limits = "all",
     figsize: tuple[float, float] | None = None,
     dpi: int = 200,
 ) -> Axes | list[Axes]:
@@ -162,6 +173,12 @@ def compare(
         of both signs occur.
     cmap : str, optional
         Colour map of matplotlib.
+    norm : {"linear", "log", "sqrt", "symlog"}
+        Scale of the colours: linear; logarithmic, over at most four decades; square root, with the
+        sign of the value; or logarithmic on both sides of a linear range around zero.
+    limits : {"all", "each"}
+        "all" gives all steps the same limits of colours. "each" gives each step the limits of its
+        own values, which its title states.
     figsize : (float, float), optional
         Width and height of the figure in inches.
     dpi : int
@@ -184,7 +201,8 @@ def compare(
     >>> left, right = first.pbd.compare(second, "pe1")
     """
     look = PlotOptions(
-        filled, contours, bonds, broken, outline, numbers, vmin, vmax, cmap, figsize, dpi
+        filled, contours, bonds, broken, outline, numbers, vmin, vmax, cmap, norm,
+        limits, figsize, dpi,
     )  # fmt: skip
     refuse_no_matplotlib()
     from pbdkit.plotting.configuration import draw_comparison

@@ -6,8 +6,9 @@ drawn depends on the distance of particles on the page: only what is legible is 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,17 +17,27 @@ from matplotlib.transforms import ScaledTranslation
 
 from pbdkit.errors import ExperimentError
 from pbdkit.io.layout import in_this_layout
-from pbdkit.plotting.colours import OF_KINDS, Palette, Scale, palette_of, scale_of
+from pbdkit.plotting.colours import (
+    OF_KINDS,
+    Palette,
+    Scale,
+    in_shares,
+    palette_of,
+    scale_of,
+    scale_within,
+)
 from pbdkit.plotting.data import (
     Extent,
     PlottedQuantity,
     ReferenceBody,
     Snapshot,
     Trajectory,
+    coloured_rows,
     combine,
     extent_of,
     of_one_run,
     quantity_of,
+    value_range,
 )
 from pbdkit.plotting.figure_layout import Page, Panels, legend_handles, style_bar
 from pbdkit.plotting.layers import (
@@ -72,9 +83,8 @@ def draw(
         raise ExperimentError(
             f"expected one axes for each of {len(snapshots)} steps, got {len(targets)}"
         )
-    sheet = PanelFigure(
-        [recording] * len(snapshots), titles, recording.title, extent, look, targets
-    )
+    recordings = [recording] * len(snapshots)
+    sheet = PanelFigure(recordings, titles, recording.title, extent, look, targets)
     for panel, snapshot in zip(sheet.panels, snapshots, strict=True):
         panel.show(snapshot)
         if look.numbers:
@@ -266,17 +276,46 @@ MAX_ENLARGEMENT = 2.5
 """Maximum factor by which the page is enlarged to make numbers legible."""
 
 
+LONGEST_LIMITS = ": −0.000123 to 0.000123"
+"""Text for which titles have room if they state the limits of colours."""
+
+
 class Panel:
-    """Axes with layers. Each layer shows one step at a time."""
+    """Axes with layers. Each layer shows one step at a time. If `scale_of` is given, it returns the
+    scale of a step, and the limits of this scale follow the title.
 
-    def __init__(self, ax: Axes, drawn: list[Layer]) -> None:
-        self.ax, self._layers = ax, drawn
+    `is_shortened` is true if there was no room for the whole title.
+    """
+
+    def __init__(
+        self,
+        ax: Axes,
+        drawn: list[Layer],
+        title: str,
+        scale_of: Callable[[Snapshot], Scale] | None,
+    ) -> None:
+        self.ax, self._layers, self._scale_of = ax, drawn, scale_of
         self.artists = [artist for layer in drawn for artist in layer.artists]
+        shown = ax.get_title()
+        self.is_shortened = shown != _with_room(title, stating_limits=scale_of is not None)
+        self._title = shown[: -len(LONGEST_LIMITS)] + "…" if self.is_shortened else title
 
-    def show(self, snapshot: Snapshot) -> None:
-        """Show a step in place of the previous one."""
+    def show(self, snapshot: Snapshot, title: str | None = None) -> None:
+        """Show a step in place of the previous one. If a title is given, it replaces that of the
+        previous step."""
+        scale = self._scale_of(snapshot) if self._scale_of else None
+        if title is not None or scale is not None:
+            limits = f": {scale.text}" if scale else ""
+            self.ax.title.set_text(f"{self._title if title is None else title}{limits}")
         for layer in self._layers:
+            if scale is not None:
+                layer.rescale(scale)
             layer.show(snapshot)
+
+
+def _with_room(title: str, *, stating_limits: bool) -> str:
+    """Return a title with the longest text of limits."""
+    return title + LONGEST_LIMITS if stating_limits else title
 
 
 class PanelFigure:
@@ -306,7 +345,9 @@ class PanelFigure:
         assert first.quantity is not None
         self._quantity, self._body = first.quantity, first.body
         self._palette = palette_of(self._quantity) if self._quantity.words else None
-        panels = Panels(extent.box, titles, heading, first.axis_labels)
+        is_each = look.limits == "each" and self._palette is None
+        with_room = [_with_room(title, stating_limits=is_each) for title in titles]
+        panels = Panels(extent.box, with_room, heading, first.axis_labels)
         self._page = (
             Page(panels, look.dpi, look.figsize, standalone=standalone) if axes is None else None
         )
@@ -328,8 +369,13 @@ class PanelFigure:
             self._style, distance=self._spacing()
         )  # The legend occupies a part of the page.
         self.panels = [
-            Panel(ax, list(self._layers(ax, recording)))
-            for ax, recording in zip(self.axes, recordings, strict=True)
+            Panel(
+                ax,
+                list(self._layers(ax, recording)),
+                title,
+                partial(self._scale_within, recording.body) if is_each else None,
+            )
+            for ax, recording, title in zip(self.axes, recordings, titles, strict=True)
         ]
 
     @property
@@ -348,6 +394,14 @@ class PanelFigure:
         inches = ax.get_window_extent().transformed(self.figure.dpi_scale_trans.inverted())
         scale = min(inches.width / (xmax - xmin), inches.height / (ymax - ymin))
         return float(72 * scale * self._body.spacing)
+
+    def _scale_within(self, body: ReferenceBody, snapshot: Snapshot) -> Scale:
+        """Return the scale of one step."""
+        assert self._scale is not None
+        rows = coloured_rows(body, self._quantity, in_body=self._style.filled)
+        return scale_within(
+            self._scale, self._quantity, value_range(snapshot.values, rows), self._look
+        )
 
     def _scale_of_all(self) -> Scale | None:
         if self._palette is not None:
@@ -390,7 +444,11 @@ class PanelFigure:
     def _key(self) -> None:
         """Add the colour bar, and a legend of the kinds that are visible."""
         quantity, scale, page = self._quantity, self._scale, self._page
+        is_each = self._look.limits == "each"
         text = label(quantity.meaning, quantity.units, scale.exponent if scale else 0)
+        if scale and is_each:
+            text = label(quantity.meaning, quantity.units)
+            scale = in_shares(scale)
         of_kinds = self._style.dots == "kinds"
         palette = OF_KINDS if of_kinds else self._palette
         if page:

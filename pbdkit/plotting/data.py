@@ -26,6 +26,7 @@ from pbdkit.io.layout import (
     diagnostics_that_provide,
     json_attribute,
     rows_of,
+    with_principal_values,
 )
 from pbdkit.lattice.raster import FRAME
 from pbdkit.model.bodies import AnyBody, Body as Shape, Sites
@@ -289,7 +290,8 @@ class PlottedQuantity:
     """A quantity with a value for each `owner`, which is particle or bond. The value is taken from
     the variable `variable`. If this is a vector, the value is the component with the index
     `component`, or the length of the vector if `component` is None. Values have to be multiplied by
-    `factor` to be in `units`. `words` contains the meanings of values that are integer codes."""
+    `factor` to be in `units`. `words` contains the meanings of values that are integer codes, and
+    `whole` is true for other integers."""
 
     variable: str
     owner: str
@@ -299,6 +301,7 @@ class PlottedQuantity:
     vector: bool
     component: int | None
     words: dict[int, str]
+    whole: bool
 
     @property
     def is_place(self) -> bool:
@@ -377,6 +380,7 @@ def quantity_of(dataset: xarray.Dataset, name: str) -> PlottedQuantity:
         vector,
         component,
         words,
+        chosen.dtype.kind in "iu" and not words,
     )
 
 
@@ -624,7 +628,7 @@ class Trajectory:
 def of_one_run(dataset: xarray.Dataset) -> xarray.Dataset:
     """Return the dataset with a time dimension. Raises ExperimentError if its positions are not
     those of one run in the plane."""
-    dataset = _with_positions(dataset)
+    dataset = with_principal_values(_with_positions(dataset))
     position = dataset["position"]
     extra_dims = [str(d) for d in position.dims if d not in ("time", "particle", "axis")]
     if extra_dims:
@@ -696,15 +700,15 @@ def extent_of(recording: Trajectory, snapshots: Iterable[Snapshot], look: PlotOp
     reference = body.reference if look.outline else np.empty((0, 2))
     low, high = [reference.min(axis=0, initial=np.inf)], [reference.max(axis=0, initial=-np.inf)]
     inner, outer, kinds, classes = [], [], set[int](), set[int]()
-    inside = body.inside if quantity is None or quantity.owner == "particle" else slice(None)
+    inside = coloured_rows(body, quantity, in_body=True)
     for snapshot in snapshots:
         place = snapshot.position[np.isfinite(snapshot.position).all(axis=1)]
         low.append(place.min(axis=0, initial=np.inf))
         high.append(place.max(axis=0, initial=-np.inf))
         kinds |= _numbers(snapshot.kind)
         if snapshot.values is not None:
-            inner.append(_range(snapshot.values[inside]))
-            outer.append(_range(snapshot.values))
+            inner.append(value_range(snapshot.values, inside))
+            outer.append(value_range(snapshot.values))
             if quantity and quantity.words:
                 classes |= _numbers(snapshot.values)
     lowest, highest = np.min(low, axis=0), np.max(high, axis=0)
@@ -741,9 +745,19 @@ def _numbers(values: Array) -> set[int]:
     return {int(low) for low in np.flatnonzero(np.bincount(integers))}
 
 
-def _range(values: Array) -> tuple[float, float]:
+def coloured_rows(
+    body: ReferenceBody, quantity: PlottedQuantity | None, *, in_body: bool
+) -> Array | slice:
+    """Return the rows of the values that determine the limits of colours. With `in_body`, frame
+    points are excluded."""
+    of_particles = quantity is None or quantity.owner == "particle"
+    return body.inside if in_body and of_particles else slice(None)
+
+
+def value_range(values: Array | None, rows: Array | slice = slice(None)) -> tuple[float, float]:
     """Return the lowest and the highest value. Both are NaN if there are no values."""
-    finite = values[np.isfinite(values)]
+    finite = np.empty(0) if values is None else values[rows]
+    finite = finite[np.isfinite(finite)]
     return (float(finite.min()), float(finite.max())) if len(finite) else (np.nan, np.nan)
 
 
@@ -772,6 +786,7 @@ def variable(dataset: xarray.Dataset, name: str) -> xarray.DataArray:
     """
     if not isinstance(name, str):
         raise ExperimentError(f"expected the name of a variable, such as 'pe1', got {name!r}")
+    dataset = with_principal_values(dataset)
     (whole, component), axes = component_of(dataset, name), axes_of(dataset)
     if whole not in dataset.variables:
         raise ExperimentError(_unknown(dataset, name, axes))

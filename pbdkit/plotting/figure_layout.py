@@ -23,7 +23,7 @@ from matplotlib.ticker import FixedLocator, MaxNLocator
 from matplotlib.transforms import Bbox
 
 from pbdkit.errors import ExperimentError
-from pbdkit.plotting.colours import Palette, Scale
+from pbdkit.plotting.colours import Palette, Scale, symlog_ticks
 from pbdkit.plotting.layers import DOT_COLOUR
 from pbdkit.plotting.style import renderer_of
 from pbdkit.progress import in_notebook
@@ -97,11 +97,21 @@ def new_figure(*, standalone: bool = False, **options: Any) -> Figure:
     return figure
 
 
+LIMITS = ("lowest", "highest")
+"""Tick labels of a colour bar for panels with different limits."""
+
+
 def style_bar(bar: Any, scale: Scale) -> None:
     """Label the ticks of a colour bar. The power of ten, which is written in the label of the bar,
     is omitted."""
     ten = 10.0**scale.exponent
     bar.formatter = lambda value, _: f"{value / ten + 0.0:.6g}".replace("-", "−")
+    if scale.whole:
+        bar.locator = MaxNLocator(6, integer=True, steps=[1, 2, 5, 10], min_n_ticks=1)
+    if (ticks := symlog_ticks(scale)) is not None:
+        bar.locator = FixedLocator(ticks)
+    if scale.shares:
+        bar.locator, bar.formatter = FixedLocator([0.0, 1.0]), lambda share, _: LIMITS[round(share)]
     bar.update_ticks()
     bar.minorticks_off()
     bar.ax.tick_params(labelsize=TICK_PT)

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.colors import ListedColormap, Normalize
 
@@ -156,6 +157,12 @@ class Layer(ABC):
     @abstractmethod
     def show(self, snapshot: Snapshot) -> None:
         """Show a step in place of the previous one."""
+
+    def rescale(self, scale: Scale) -> None:
+        """Set the limits of the colours of values."""
+        for artist in self.artists:
+            if isinstance(artist, ScalarMappable):
+                artist.set_norm(scale.norm)
 
 
 class PixelField(Layer):

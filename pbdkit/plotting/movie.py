@@ -23,7 +23,7 @@ from pbdkit.errors import (
 from pbdkit.io.atomic_file import NewFile, open_atomic
 from pbdkit.io.layout import as_step
 from pbdkit.plotting.data import Extent, Snapshot, Trajectory, extent_of
-from pbdkit.plotting.style import PlotOptions
+from pbdkit.plotting.style import Limits, Norm, PlotOptions
 
 if TYPE_CHECKING:
     import xarray
@@ -78,6 +78,8 @@ def animate(
     vmin: float | None = None,
     vmax: float | None = None,
     cmap: str | None = None,
+    norm: Norm = "linear",
+    limits: Limits = "all",
     figsize: tuple[float, float] | None = None,
     dpi: int = DPI,
 ) -> None:
@@ -115,6 +117,12 @@ def animate(
         of both signs occur.
     cmap : str, optional
         Colour map of matplotlib.
+    norm : {"linear", "log", "sqrt", "symlog"}
+        Scale of the colours: linear; logarithmic, over at most four decades; square root, with the
+        sign of the value; or logarithmic on both sides of a linear range around zero.
+    limits : {"all", "each"}
+        "all" gives all steps the same limits of colours. "each" gives each step the limits of its
+        own values, which its title states.
     figsize : (float, float), optional
         Width and height of the figure in inches.
     dpi : int
@@ -136,7 +144,8 @@ def animate(
     refuse_no_movie(path)
     _refuse_speed(path, fps, every)
     look = PlotOptions(
-        filled, contours, bonds, broken, outline, False, vmin, vmax, cmap, figsize, dpi
+        filled, contours, bonds, broken, outline, False, vmin, vmax, cmap, norm,
+        limits, figsize, dpi,
     )  # fmt: skip
     recording = Trajectory(dataset, color or "kind")
     rows = [*range(0, len(recording.steps), every)]
@@ -190,6 +199,8 @@ def animation(
     vmin: float | None = None,
     vmax: float | None = None,
     cmap: str | None = None,
+    norm: Norm = "linear",
+    limits: Limits = "all",
     figsize: tuple[float, float] | None = None,
     dpi: int = 80,
 ) -> FuncAnimation:
@@ -217,6 +228,12 @@ def animation(
         of both signs occur.
     cmap : str, optional
         Colour map of matplotlib.
+    norm : {"linear", "log", "sqrt", "symlog"}
+        Scale of the colours: linear; logarithmic, over at most four decades; square root, with the
+        sign of the value; or logarithmic on both sides of a linear range around zero.
+    limits : {"all", "each"}
+        "all" gives all steps the same limits of colours. "each" gives each step the limits of its
+        own values, which its title states.
     figsize : (float, float), optional
         Width and height of the figure in inches.
     dpi : int
@@ -236,7 +253,8 @@ def animation(
     from matplotlib.animation import FuncAnimation
 
     look = PlotOptions(
-        filled, contours, bonds, broken, outline, False, vmin, vmax, cmap, figsize, dpi
+        filled, contours, bonds, broken, outline, False, vmin, vmax, cmap, norm,
+        limits, figsize, dpi,
     )  # fmt: skip
     recording = Trajectory(dataset, color or "kind")
     last = len(recording.steps) - 1
@@ -289,7 +307,7 @@ class MovieFigure:
         )
         (self._panel,) = self.sheet.panels
         self._heading = self._panel.ax.title
-        if self._heading.get_text() != title:  # The title was too long.
+        if self._panel.is_shortened:
             self._name = ""
 
     def _title(self, step: float) -> str:
@@ -297,8 +315,7 @@ class MovieFigure:
 
     def put(self, snapshot: Snapshot) -> list[Any]:
         """Show a step, and return the changed artists."""
-        self._panel.show(snapshot)
-        self._heading.set_text(self._title(snapshot.step))
+        self._panel.show(snapshot, self._title(snapshot.step))
         return [*self._panel.artists, self._heading]
 
     def frames(self, rows: Sequence[int], show: Show = silent) -> Iterator[Frame]:

@@ -7,7 +7,7 @@ import textwrap
 from collections.abc import Mapping
 from dataclasses import dataclass
 from numbers import Real
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
@@ -93,6 +93,12 @@ MAX_DPI = 2400
 """Maximum resolution, in dots per inch."""
 
 
+Norm = Literal["linear", "log", "sqrt", "symlog"]
+"""Scale of colours."""
+Limits = Literal["all", "each"]
+"""Whether limits of colours belong to all drawn steps, or to each of them."""
+
+
 @dataclass(frozen=True)
 class PlotOptions:
     """Options of `plot`, `compare` and `animate`. They have the same names as the arguments of
@@ -110,6 +116,8 @@ class PlotOptions:
     vmin: float | None = None
     vmax: float | None = None
     cmap: str | None = None
+    norm: Norm = "linear"
+    limits: Limits = "all"
     figsize: tuple[float, float] | None = None
     dpi: int = 200
 
@@ -126,6 +134,15 @@ class PlotOptions:
             raise ExperimentError(f"dpi: {self.dpi} is not between {MIN_DPI} and {MAX_DPI}")
         if self.contours and self.filled is False:
             raise ExperimentError("contours require filled=True, got filled=False")
+        for name, value, choices in (("norm", self.norm, Norm), ("limits", self.limits, Limits)):
+            if value not in get_args(choices):
+                raise ExperimentError(
+                    f"{name}: expected {', '.join(get_args(choices))}; got {value!r}"
+                )
+        if self.limits == "each" and not (self.vmin is None and self.vmax is None):
+            raise ExperimentError(
+                "limits='each' determines the limits of each step; omit it, or vmin and vmax"
+            )
 
     def _check_limits(self) -> None:
         for name, limit in (("vmin", self.vmin), ("vmax", self.vmax)):

@@ -27,7 +27,13 @@ from pbdkit.bench.work_precision import COLUMNS
 from pbdkit.errors import ExperimentError, PbdkitError, StorageError
 from pbdkit.io.atomic_file import write
 from pbdkit.io.explain import BondRecords, BondStatus
-from pbdkit.io.layout import OF_BODY, in_this_layout, json_attribute, scene_of
+from pbdkit.io.layout import (
+    OF_BODY,
+    in_this_layout,
+    json_attribute,
+    scene_of,
+    with_principal_values,
+)
 from pbdkit.io.members import STATUS, SWEEP, TEXT, type_alone
 from pbdkit.io.open import reading
 from pbdkit.io.physical import TWIN_OF
@@ -1310,6 +1316,7 @@ def report(
 
 def report_text(dataset: xarray.Dataset, measured: dict[str, Any] | None = None) -> str:
     """Return the page as text. `measured` is a table of a benchmark, as returned by `speed`."""
+    dataset = with_principal_values(dataset)
     content = (SweepContent if SWEEP in dataset.attrs else RunContent)(dataset)
     budget, best = FIRST, ""
     for _ in range(MAX_ATTEMPTS):
