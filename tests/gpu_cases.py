@@ -2,6 +2,7 @@
 process of its own, as numba requires (NUMBA_ENABLE_CUDASIM=1)."""
 
 import os
+import sys
 
 import numpy as np
 from particle_operations import Drag, Wind
@@ -135,12 +136,19 @@ def scenes():
     return found | {"in space": test_axes.scene("numpy", 1.2)}
 
 
-def compare():
-    """Each kernel for one block and for several."""
+def names(every):
+    """Return a share of the names of scenes; all of them if `every` is 1."""
+    return [*SHEETS, *OTHERS, "in space"][::every]
+
+
+def compare(every):
+    """Each kernel for one block and for several, of a share of the scenes."""
     from pbdkit.stepping import cuda_engine as program
     from pbdkit.stepping.cuda_engine import GpuStepper
 
     for name, scene in scenes().items():
+        if name not in names(every):
+            continue
         for alone in (0, 4096) if name in ("torn", "moves of another") else (4096,):
             program.ALONE = alone
             with np.errstate(all="ignore"):
@@ -153,4 +161,4 @@ def compare():
 
 if __name__ == "__main__":
     assert os.environ["NUMBA_ENABLE_CUDASIM"] == "1"
-    compare()
+    compare(int(sys.argv[1]) if sys.argv[1:] else 1)

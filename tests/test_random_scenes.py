@@ -8,7 +8,7 @@ import numpy as np
 import plain_loops
 import pytest
 from hypothesis import assume, given, strategies as st
-from scene_strategies import experiments, grids, initials, pulled_apart, samples
+from scene_strategies import experiments, grids, in_turn, initials, pulled_apart, samples
 
 import pbdkit
 
@@ -66,7 +66,7 @@ def compare(experiment):
         )
 
 
-@pytest.mark.parametrize("name", ["a", "b", "c", "d1", "d2", "e", "f1", "f2", "g"])
+@pytest.mark.parametrize("name", in_turn(["a", "b", "c", "d1", "d2", "e", "f1", "f2", "g"], 2))
 def test_cases_of_the_paper_match_the_plain_loops(name):
     experiment = pbdkit.load(f"paper/{name}", settings=["steps=60"])
     raw = experiment.model_dump(mode="json")

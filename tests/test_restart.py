@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 import pytest
 from hypothesis import assume, given
-from scene_strategies import experiments, samples
+from scene_strategies import experiments, in_turn, samples
 
 import pbdkit
 from pbdkit.io import netcdf as netcdf_sink
@@ -121,7 +121,7 @@ def assert_same(one: Path, other: Path) -> None:
         np.testing.assert_array_equal(value, values_2[name], err_msg=name)
 
 
-@pytest.mark.parametrize("change", RUNS)
+@pytest.mark.parametrize("change", in_turn(RUNS, 2))
 def test_run_in_parts_equals_the_whole_run(
     change: str, tensile: dict[str, Any], tmp_path: Path
 ) -> None:
@@ -336,7 +336,7 @@ LATER: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("later", LATER)
+@pytest.mark.parametrize("later", in_turn(LATER, 2))
 @pytest.mark.filterwarnings("ignore:.* (begins|after the last step)")
 def test_converging_run_is_extended_to_the_longer_one(later: str, tmp_path: Path) -> None:
     """Events after the shorter run take place, whether or not it has converged."""

@@ -99,7 +99,7 @@ def test_all_broken_plugins_together_stop_no_command(
 
 
 @pytest.mark.usefixtures("healthy")
-@pytest.mark.parametrize("kind", BROKEN)
+@pytest.mark.parametrize("kind", in_turn(BROKEN, 2))
 def test_no_broken_plugin_stops_a_command(install: Install, call: Call, kind: str) -> None:
     """Choose a run, of which others read the result, and some of the other commands, each in its
     turn."""

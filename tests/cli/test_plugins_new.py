@@ -18,6 +18,7 @@ import jsonschema
 import pytest
 from interpreted_kernels import interpreting
 from plugin_sources import listed
+from scene_strategies import in_turn
 
 import pbdkit
 from pbdkit.cli.interface import INTERFACE_NAMES as OFFERED
@@ -82,7 +83,7 @@ def test_project_passes_conformance(new: New, interface: str) -> None:
     assert report.holds, str(report)
 
 
-@pytest.mark.parametrize("interface", OFFERED)
+@pytest.mark.parametrize("interface", in_turn(OFFERED, 3))
 def test_example_validates_in_editors(new: New, interface: str) -> None:
     folder = new("pbdkit-brand-new", interface)
     source = read_file(folder / "example.yaml")

@@ -68,7 +68,7 @@ def came_to_rest(state):
 
 
 @pytest.mark.filterwarnings("ignore::pbdkit.PbdkitWarning")  # drawn scenes may be doubtful
-@samples(4)
+@samples(2)
 @given(experiments())
 def test_stepping_random_scenes_leads_to_their_equilibrium(experiment):
     """If steps from the start converge, they do so within the error bound."""

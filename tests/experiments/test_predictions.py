@@ -100,7 +100,7 @@ def shaken(scene, state):
     return state
 
 
-@pytest.mark.parametrize("name", in_turn(BARE, 2))
+@pytest.mark.parametrize("name", in_turn(BARE, 4))
 def test_runs_converge_in_the_predicted_steps(call, name):
     """With bonds that hold: torn bodies have another operator, see below."""
     whole = ["fracture={type: none}"] if name in TORN else []
@@ -128,7 +128,7 @@ def test_runs_converge_in_the_predicted_steps(call, name):
     assert abs(math.log(excess)) < 0.05 * math.log(1e3)
 
 
-@pytest.mark.parametrize("name", in_turn(STEPS, 2))
+@pytest.mark.parametrize("name", in_turn(STEPS, 3))
 def test_broken_bodies_stay_stable_and_converge_more_slowly(call, name):
     """The prediction is for the unbroken body, and the output states that; the operator of the torn
     one has the rate.

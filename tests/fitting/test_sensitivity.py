@@ -212,7 +212,7 @@ RULES_AND_FRAMES = [
     (rule, frame)
     for n, rule in enumerate(sensitivity_cases.RULES)
     for m, frame in enumerate(sensitivity_cases.FRAMES)
-    if AT_LENGTH or frame == sensitivity_cases.full_frame(rule) or (n + m) % 5 == 0
+    if AT_LENGTH or frame == sensitivity_cases.full_frame(rule) or (n + m) % 10 == 0
 ]
 """Each rule with the frame for which all its parameters are compared, and with others in turn."""
 

@@ -36,10 +36,10 @@ OUT = Path("out.nc")
 @pytest.mark.parametrize(
     "trial",
     [
-        "kill_runs --trials 2 --kinds breaking",
-        "two_writers --trials 2 --kinds small",
-        "mutate_stores --trials 2 --kinds breaking",
-        "mutate_sweeps --trials 2",
+        "kill_runs --trials 1 --kinds breaking",
+        "two_writers --trials 1 --kinds small",
+        "mutate_stores --trials 1 --kinds breaking",
+        "mutate_sweeps --trials 1",
         "equilibria fracture --trials 3",
         "equilibria bounds --trials 5",
         "fit_coverage --trials 10 --processes 1 --kinds poisson",

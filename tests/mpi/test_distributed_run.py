@@ -21,7 +21,7 @@ import pytest
 from hypothesis import assume, given, strategies as st
 from property_cases import HOLD_LEFT, pull_right
 from remembering_parts import Tiring, Weakest
-from scene_strategies import calibrated_experiments, experiments, pulled_apart, samples
+from scene_strategies import calibrated_experiments, experiments, in_turn, pulled_apart, samples
 from thread_ranks import on_ranks
 
 import pbdkit
@@ -274,7 +274,7 @@ def test_sums_over_cells_have_a_fixed_order(tmp_path, monkeypatch):
     compare(sheet(**OTHERS["every diagnostic of cells"]), tmp_path, 3)
 
 
-@pytest.mark.parametrize("name", OTHERS)
+@pytest.mark.parametrize("name", in_turn(OTHERS, 2))
 def test_further_kinds_of_scenes(name, tmp_path):
     compare(sheet(**OTHERS[name]), tmp_path, 3)
 
@@ -286,7 +286,7 @@ kernels do as numpy does is tested with the engine."""
 
 @pytest.mark.parametrize(
     ("name", "engine"),
-    [*((name, "numpy") for name in CASES), *((name, "compiled") for name in COMPILED)],
+    [*((name, "numpy") for name in in_turn(CASES, 2)), *((name, "compiled") for name in COMPILED)],
 )
 def test_every_kind_of_scene(name, engine, tmp_path, request):
     """Kernels of runs of a few steps are interpreted, and compiled in the profile `long`."""

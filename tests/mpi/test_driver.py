@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 from property_cases import HOLD_LEFT, pull_right
-from scene_strategies import samples
+from scene_strategies import in_turn, samples
 from thread_ranks import on_ranks
 from turning_frame import Turning
 
@@ -106,7 +106,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", in_turn(CASES, 2))
 def test_several_processes_agree_with_one(name, tmp_path):
     given_ = strip(**CASES[name])
     compare(given_, tmp_path, 3)

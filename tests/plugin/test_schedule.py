@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import xarray as xr
 from hypothesis import given, strategies as st
+from scene_strategies import in_turn
 from thread_ranks import on_ranks
 
 import pbdkit
@@ -624,7 +625,8 @@ def test_every_shipped_scheduled_parameter_is_compared():
 
 
 @pytest.mark.parametrize(
-    ("kind", "number"), [(kind, number) for kind, own in SHIPPED.items() for number in own]
+    ("kind", "number"),
+    in_turn(((kind, number) for kind, own in SHIPPED.items() for number in own), 2),
 )
 def test_states_and_measurements_of_each_step_use_its_values(kind, number):
     """Compare every number that ships, with masses, guides and an obstacle, with a scene built

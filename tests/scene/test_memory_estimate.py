@@ -7,6 +7,7 @@ import tracemalloc
 from pathlib import Path
 
 import pytest
+from scene_strategies import in_turn
 
 import pbdkit
 from pbdkit.io.netcdf import NetcdfSink
@@ -130,7 +131,9 @@ EQUILIBRIA = {"factors": (80, [*CALIBRATED, "solver.method=lu"]), "grids": (800,
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="the system tells no peak")
-@pytest.mark.parametrize(("side", "settings"), EQUILIBRIA.values(), ids=EQUILIBRIA)
+@pytest.mark.parametrize(
+    ("side", "settings"), in_turn(EQUILIBRIA.values(), 2), ids=in_turn(EQUILIBRIA, 2)
+)
 def test_memory_of_an_equilibrium_matches_the_estimate_of_check(side, settings, tmp_path):
     """The peak of a fresh process above that of its imports, within 30 %."""
     sides = [f"body.columns={side}", f"body.rows={side}", "solver={type: equilibrium}"]

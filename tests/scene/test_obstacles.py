@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import shapely
 from interpreted_kernels import interpreting
+from scene_strategies import in_turn
 
 import pbdkit
 from pbdkit.model.boundary_conditions import Obstacle
@@ -209,7 +210,7 @@ CASES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", in_turn(CASES, 2))
 def test_both_engines_agree_to_the_last_bit(case: str) -> None:
     scene = build_scene(pbdkit.Experiment(**CASES[case]))
     with interpreting():

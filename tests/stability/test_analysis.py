@@ -174,7 +174,7 @@ def test_the_distance_weighted_rule_is_reported_unstable_with_its_bound(parts, b
     assert any("is stable below" in w for w in Analysis(scene).warnings())
 
 
-@pytest.mark.parametrize(("lattice", "rule"), in_turn(product(LATTICES, RULES), 2))
+@pytest.mark.parametrize(("lattice", "rule"), in_turn(product(LATTICES, RULES), 4))
 def test_one_percent_inside_the_bound_converges_and_outside_diverges(lattice, rule):
     parts = {"lattice": LATTICES[lattice], "rule": RULES[rule]}
     start = {"type": "noise", "amplitude": 1e-9}
@@ -225,7 +225,7 @@ def test_undamped_mode_is_found():
     assert any("use a relaxation below 1" in w for w in pbdkit.analyse(given).warnings())
 
 
-@pytest.mark.parametrize("name", in_turn([n for n in shipped_names() if "to-failure" not in n], 3))
+@pytest.mark.parametrize("name", in_turn([n for n in shipped_names() if "to-failure" not in n], 5))
 def test_predictions_for_shipped_experiments_hold(name):
     """Stable ones stay within the hull of their leaders' ways, with room; all shipped ones are that
     are made of steps, and those that go straight to equilibrium stay there too. Bodies that are

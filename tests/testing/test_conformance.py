@@ -23,7 +23,7 @@ from pbdkit.testing.subject import LATTICES, NEIGHBOURS, full_name
 
 BUILT_IN = [(e, n) for c in pbdkit_components() for n, e in enumerate(examples_of(c))]
 FIRST = [example for example, n in BUILT_IN if n == 0]
-FURTHER = in_turn([example for example, n in BUILT_IN if n > 0], 3)
+FURTHER = in_turn([example for example, n in BUILT_IN if n > 0], 6)
 ONE_SITE_AND_TWO = {"lattice": [LATTICES["square"], LATTICES["hexagonal"]]}
 NEAREST = {"neighbours": [NEIGHBOURS["coordination-1"], NEIGHBOURS["chebyshev-1"]]}
 

@@ -162,9 +162,9 @@ COMPONENTS = {
 }
 
 
-@pytest.mark.parametrize("parts", COMPONENTS.values(), ids=COMPONENTS)
-def test_kernel_logic_for_every_component(parts, interpreted, monkeypatch):
-    scene = build_scene(pbdkit.Experiment(**sheet(**parts)))
+@pytest.mark.parametrize("name", in_turn(COMPONENTS, 2))
+def test_kernel_logic_for_every_component(name, interpreted, monkeypatch):
+    scene = build_scene(pbdkit.Experiment(**sheet(**COMPONENTS[name])))
     assert_bitwise_equal(scene, CompiledStepper(scene))
     monkeypatch.setattr(choice, "PATIENCE_S", 0.0)
     assert choose(scene).engine == "compiled"
@@ -254,7 +254,7 @@ def test_kernel_logic_on_any_number_of_threads(parts, banded, interpreted):
     assert_bitwise_equal(scene, CompiledStepper(scene), CompiledStepper(scene, 2), calls=(1, 2, 7))
 
 
-@pytest.mark.parametrize("name", in_turn(THREADED, 2))
+@pytest.mark.parametrize("name", in_turn(THREADED, 4))
 def test_any_number_of_threads_gives_the_same(name, banded):
     scene = banded(THREADED[name])
     assert_bitwise_equal(scene, CompiledStepper(scene, 2))
