@@ -118,10 +118,11 @@ class Moves:
         return moves
 
     def _stop(self, moves: Floats, step: int) -> None:
-        """Set the moves of leaders and frame points to zero."""
+        """Set the moves of leaders and frame points to zero. At time 0, the leaders are those of
+        step 1."""
         still, frame = moves.reshape(len(moves), -1), self._scene.frame
         for leading in self._scene.leading:
-            for axis in leading.axes if leading.group.leads(step) else ():
+            for axis in leading.axes if leading.group.leads(max(step, 1)) else ():
                 still[axis, leading.place] = 0.0
         if frame:
             still[:, frame.place] = 0.0

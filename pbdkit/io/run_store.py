@@ -120,6 +120,7 @@ class RunStore:
                 for key in obsolete:
                     self._file.execute("DELETE FROM pieces WHERE key = ?", (key,))
                     listed.pop(key, None)
+                    self._verified.pop(key, None)
                 for key, data in pieces:
                     digests[key] = self._put(key, data)
                 listed, number = listed | digests, self.commits + 1

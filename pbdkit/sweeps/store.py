@@ -240,7 +240,8 @@ class Store:
         """Return the report in a row of the table, or a message if it is damaged."""
         fault = "has changed since it was written"
         key, status, message, is_large, digest, content = row or (None,) * 6
-        if not re.fullmatch("[0-9a-f]{32}", str(key)):
+        texts = isinstance(status, str) and isinstance(message, str)
+        if not texts or not re.fullmatch("[0-9a-f]{32}", str(key)):
             return fault
         if is_large:
             try:

@@ -234,6 +234,17 @@ def put(key: str, data: bytes) -> None:
         store.commit([(key, data)])
 
 
+def test_piece_that_was_deleted_can_be_stored_again(tmp_path: Path) -> None:
+    """As a batch of equal values, which is committed, written to the file, and filled again."""
+    piece = ("array/waiting.broken/0", b"zeros")
+    with RunStore(tmp_path / "out.nc.run", mode="rwc") as store:
+        store.commit([piece])
+        store.commit([], [piece[0]])
+        store.commit([piece])
+    with RunStore(tmp_path / "out.nc.run") as store:
+        assert store.piece(piece[0]) == piece[1]
+
+
 def test_a_newer_store_is_refused_with_its_version(
     call: Any, often: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -213,6 +213,20 @@ def test_flipped_bit_is_named_and_that_member_reruns(small, tmp_path, run_only):
         assert len(run_only) == 1
 
 
+@pytest.mark.parametrize("column", ["status", "message"])
+def test_text_that_became_bytes_is_damage(small, tmp_path, run_only, column):
+    """In a record of SQLite, one bit distinguishes both types."""
+    asked = {"vary": {"steps": [5, 6]}, "folder": tmp_path}
+    first = swept(small, **asked)
+    with sqlite3.connect(tmp_path / stores.DATABASE) as database:
+        database.execute(f"UPDATE member SET {column} = CAST({column} AS BLOB) WHERE rowid = 2")
+    database.close()
+    run_only.clear()
+    with pytest.warns(pbdkit.PbdkitWarning, match="row 2 has changed since"):
+        same(first, swept(small, **asked))
+    assert len(run_only) == 1
+
+
 def flip(path, column):
     """Change one bit of the second row, without a call of SQLite."""
     with sqlite3.connect(path) as database:
