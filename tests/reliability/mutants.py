@@ -1,0 +1,594 @@
+"""Mutation testing: draw small changes of the source at random, and count those that tests detect.
+
+The operators are those of cosmic-ray, and one more for the text of kernels. Each mutant is written
+to a copy of the repository. A process that is forked from a prepared one executes the tests that
+cover the changed statement, cheapest first, until one of them fails. Which tests cover a statement,
+and what each test costs, is measured once for each state of the repository.
+
+    pip install --group nightly
+    python tests/reliability/mutants.py --count 500 --seed 1
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import hashlib
+import importlib
+import json
+import os
+import random
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import traceback
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import parso
+import pytest
+from cosmic_ray.ast import ast_nodes
+from cosmic_ray.mutating import mutate_code
+from cosmic_ray.operators.operator import Operator
+from cosmic_ray.plugins import get_operator
+from parso.python.tree import FStringString, String
+
+ROOT = Path(__file__).parents[2]
+AREAS = {
+    "evaluator": [
+        "stepping/rule_evaluation.py",
+        "stepping/followers.py",
+        "stepping/bond_breaking.py",
+        "stepping/leaders.py",
+        "stepping/state.py",
+        "scene/constants.py",
+        "components/rules.py",
+        "components/elasticity.py",
+        "plugin/vector.py",
+    ],
+    "engines": [
+        "stepping/numpy_engine.py",
+        "stepping/program.py",
+        "stepping/step.py",
+        "stepping/kernel.py",
+        "stepping/numba_engine/*.py",
+        "equilibrium/grid_kernels.py",
+        "equilibrium/breaking_kernel.py",
+    ],
+    "equilibrium": [
+        "equilibrium/newton.py",
+        "equilibrium/load_stepping.py",
+        "equilibrium/system.py",
+        "equilibrium/linearise.py",
+        "equilibrium/linear_solver.py",
+        "equilibrium/sparse.py",
+        "equilibrium/stencil_matrix.py",
+        "equilibrium/lattice_system.py",
+        "equilibrium/krylov.py",
+        "equilibrium/multigrid.py",
+        "equilibrium/error_bound.py",
+    ],
+    "contact": ["stepping/contact.py", "scene/obstacles.py", "equilibrium/contact_system.py"],
+    "fits": ["fitting/*.py", "identification/*.py"],
+    "layout": [
+        "lattice/*.py",
+        "plugin/lattice.py",
+        "components/lattices.py",
+        "components/neighbours.py",
+        "components/frames.py",
+        "scene/frame.py",
+        "stepping/frame_following.py",
+        "stepping/neighbour_search.py",
+    ],
+}
+"""Source files of each area."""
+TESTS = [
+    "lattice",
+    "plugin/test_lattice.py",
+    "plugin/test_rule.py",
+    "plugin/test_vector.py",
+    "components",
+    "scene",
+    "stepping",
+    "linear",
+    "equilibrium",
+    "identification",
+    "fitting",
+    "hard_cases",
+    "mpi/test_partition.py",
+    "test_simulation.py",
+    "test_random_scenes.py",
+    "test_crossed_scenes.py",
+]
+"""Tests that are executed, below tests/."""
+REPLACEMENTS = {
+    "BinaryOperator": "Add_Sub Sub_Add Mul_Div Div_Mul Mul_Add FloorDiv_Mul Mod_FloorDiv Pow_Mul "
+    "BitOr_BitAnd BitAnd_BitOr BitXor_BitOr LShift_RShift",
+    "ComparisonOperator": "Eq_NotEq NotEq_Eq Lt_LtE LtE_Lt Gt_GtE GtE_Gt Lt_Gt Gt_Lt LtE_GtE "
+    "GtE_LtE Is_IsNot IsNot_Is",
+    "UnaryOperator": "Delete_USub Delete_Not Delete_Invert",
+}
+OPERATORS = [
+    *(f"Replace{kind}_{pair}" for kind, pairs in REPLACEMENTS.items() for pair in pairs.split()),
+    *("AddNot", "ReplaceTrueWithFalse", "ReplaceFalseWithTrue", "ReplaceAndWithOr"),
+    *("ReplaceOrWithAnd", "ReplaceBreakWithContinue", "ReplaceContinueWithBreak"),
+    *("NumberReplacer", "ZeroIterationForLoop"),
+]
+"""Operators of cosmic-ray; the others mostly raise a TypeError, or change no result."""
+IGNORED_CALLS = {"warn", "warning", "info", "debug", "cast", "TypeVar", "progress"}
+"""Functions the arguments of which do not affect results."""
+IGNORED_ARGUMENTS = {"strict", "examples", "description", "stacklevel"}
+"""Keyword arguments that do not affect results: `strict` asserts that lengths are equal."""
+IGNORED_NODES = {"raise_stmt", "assert_stmt", "decorator", "import_from", "import_name"}
+TEXT_FOLDERS = ("numba_engine", "stepping")
+"""Folders in which strings are parts of kernels."""
+LONGEST_TEST_S = 8.0
+"""Processor time above which a test is not executed."""
+OPTIONS = ["-q", "-p", "no:cacheprovider", "-o", "addopts="]
+"""Options of pytest."""
+OPTIONS += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]  # Packages are already imported.
+GOAL = 0.9
+FAULT = 70
+"""Exit status of a process in which pytest itself failed."""
+
+
+class KernelText(Operator):  # type: ignore[misc]
+    """Exchange an operator in the text of a kernel."""
+
+    PAIRS = ((" + ", " - "), (" - ", " + "), (" * ", " / "), (" < ", " <= "), (" > ", " < "))
+    PAIRS += ((" and ", " or "), ("+= 1", "+= 2"), (" == ", " != "), (" += ", " -= "))
+
+    def mutation_positions(self, node: Any) -> Iterator[tuple[Any, Any]]:
+        """Yield the position of each operator that can be exchanged."""
+        if isinstance(node, (String, FStringString)):
+            for old, _ in self.PAIRS:
+                for _ in range(node.value.count(old)):
+                    yield node.start_pos, node.end_pos
+
+    def mutate(self, node: Any, index: int) -> Any:
+        """Exchange one of them."""
+        for old, new in self.PAIRS:
+            parts = node.value.split(old)
+            if index < len(parts) - 1:
+                node.value = old.join(parts[: index + 1]) + new + old.join(parts[index + 1 :])
+                return node
+            index -= len(parts) - 1
+        raise IndexError(index)
+
+    @classmethod
+    def examples(cls) -> tuple[Any, ...]:
+        """Return no examples; cosmic-ray uses them for its own tests."""
+        return ()
+
+
+class Mutant(NamedTuple):
+    """A change of one source file; `lines` are those of the statement that contains it."""
+
+    area: str
+    path: str
+    operator: str
+    occurrence: int
+    line: int
+    lines: tuple[int, int]
+
+    @property
+    def name(self) -> str:
+        """Place and operator."""
+        return f"{self.path}:{self.line}:{self.operator}:{self.occurrence}"
+
+    def code(self) -> str:
+        """Return the source with the change."""
+        source = (ROOT / self.path).read_text()
+        code = mutate_code(source, _operator(self.operator), self.occurrence)
+        assert code is not None
+        return str(code)
+
+
+def _operator(name: str) -> Operator:
+    return KernelText() if name == "KernelText" else get_operator(f"core/{name}")()
+
+
+def _ancestors(node: Any) -> Iterator[tuple[Any, Any]]:
+    """Yield each ancestor of a node with the child that leads to the node."""
+    while node.parent is not None:
+        yield node.parent, node
+        node = node.parent
+
+
+def _is_relevant(node: Any, in_kernels: bool) -> bool:
+    """Return whether a change of the node can affect results: it is not in an annotation, a message
+    or an assertion for the type checker."""
+    if node.type == "string" and node.parent.type == "simple_stmt":
+        return False  # A docstring.
+    for parent, child in ((node, None), *_ancestors(node)):
+        kind = parent.type
+        if kind in IGNORED_NODES or (kind.startswith("fstring") and not in_kernels):
+            return False
+        if kind == "argument" and parent.children[0].get_code().strip() in IGNORED_ARGUMENTS:
+            return False
+        if kind == "annassign" and child is parent.children[1]:
+            return False
+        if kind in ("tfpdef", "funcdef") and child not in (None, parent.children[0]):
+            before = parent.children[parent.children.index(child) - 1]
+            if getattr(before, "value", "") in (":", "->") and child.type != "suite":
+                return False
+        if kind in ("if_stmt", "trailer", "atom_expr", "power"):
+            code = parent.get_code(include_prefix=False)
+            name = code.split("(", 1)[0].split(".")[-1].strip()
+            if code.startswith("if TYPE_CHECKING") or name in IGNORED_CALLS:
+                return False
+    return True
+
+
+def _statement(node: Any) -> tuple[int, int]:
+    """Return first and last line of the statement, or of the header of a compound statement."""
+    for parent, _ in _ancestors(node):
+        if parent.type == "simple_stmt":
+            return parent.start_pos[0], parent.end_pos[0]
+        if parent.type.endswith("_stmt") or parent.type in ("funcdef", "classdef"):
+            colons = (c for c in parent.children if getattr(c, "value", "") == ":")
+            last = min((c.start_pos[0] for c in colons if c.start_pos > node.start_pos), default=0)
+            return node.start_pos[0], max(last, node.end_pos[0])
+    return node.start_pos[0], node.end_pos[0]
+
+
+def mutants_of(area: str, path: Path) -> dict[tuple[int, int], list[Mutant]]:
+    """Return the mutants of a file at each place in it."""
+    relative = str(path.relative_to(ROOT))
+    in_kernels = any(f"/{folder}/" in relative for folder in TEXT_FOLDERS)
+    places: dict[tuple[int, int], list[Mutant]] = defaultdict(list)
+    names = [*OPERATORS, *(["KernelText"] if in_kernels else [])]
+    operators = {name: _operator(name) for name in names}
+    occurrences: Counter[str] = Counter()
+    for node in ast_nodes(parso.parse(path.read_text())):
+        relevant: bool | None = None
+        for name, operator in operators.items():
+            for start, _ in operator.mutation_positions(node):
+                if relevant is None:
+                    relevant = _is_relevant(node, in_kernels)
+                if relevant:
+                    lines = _statement(node)
+                    number = occurrences[name]
+                    places[start].append(Mutant(area, relative, name, number, start[0], lines))
+                occurrences[name] += 1
+    return places
+
+
+def drawn(count: int, seed: int, areas: Sequence[str]) -> list[Mutant]:
+    """Draw places in the source of each area at random, and at each place one mutant."""
+    mutants = []
+    for number, area in enumerate(areas):
+        rng = random.Random(f"{seed} {area}")
+        paths = sorted(p for part in AREAS[area] for p in (ROOT / "pbdkit").glob(part))
+        places = [choices for path in paths for choices in mutants_of(area, path).values()]
+        share = count // len(areas) + (number < count % len(areas))
+        chosen = rng.sample(places, min(share, len(places)))
+        mutants += [rng.choice(choices) for choices in chosen]
+    return mutants
+
+
+class Recording:
+    """A plugin of pytest that measures what each test costs, and which lines it executes."""
+
+    def __init__(self, coverage: Any) -> None:
+        self.coverage = coverage
+        self.cost: dict[str, float] = {}
+        self.failed: set[str] = set()
+
+    @pytest.hookimpl(hookwrapper=True)
+    def pytest_runtest_protocol(self, item: Any) -> Iterator[None]:
+        """Execute a test in a context of its own."""
+        self.coverage.switch_context(item.nodeid)
+        begun = time.process_time()
+        yield
+        self.cost[item.nodeid] = time.process_time() - begun
+        self.coverage.switch_context("")
+
+    def pytest_runtest_logreport(self, report: Any) -> None:
+        """Note tests that fail or are skipped, which cannot detect a mutant."""
+        if report.outcome != "passed":
+            self.failed.add(report.nodeid)
+
+
+def record(name: str, target: Path) -> None:
+    """Execute a file of tests in the current folder, and write which lines each test executes."""
+    import coverage
+
+    measured = coverage.Coverage(data_file=None, source=["pbdkit"])
+    recording = Recording(measured)
+    measured.start()
+    code = pytest.main([*OPTIONS, name], plugins=[recording])
+    measured.stop()
+    if code not in (pytest.ExitCode.OK, pytest.ExitCode.TESTS_FAILED):
+        raise RuntimeError(f"the tests of {name} could not be executed")
+    data = measured.get_data()
+    cost = {test: s for test, s in recording.cost.items() if test not in recording.failed}
+    numbers = {test: n for n, test in enumerate(cost)}
+    lines = {
+        str(Path(path).relative_to(Path.cwd())): {
+            line: sorted(numbers[test] for test in tests if test in numbers)
+            for line, tests in data.contexts_by_lineno(path).items()
+        }
+        for path in data.measured_files()
+    }
+    site = tuple(p for p in sys.path if p.endswith("site-packages") or "lib/python" in p)
+    modules = [
+        module
+        for module, content in sys.modules.items()
+        if (getattr(content, "__file__", None) or "").startswith(site)
+    ]
+    target.write_text(json.dumps({"cost": cost, "lines": lines, "modules": modules}))
+
+
+def test_files() -> list[str]:
+    """Return the files of tests that are executed."""
+    found = (ROOT / "tests" / name for name in TESTS)
+    files = (sorted(p.rglob("test_*.py")) if p.is_dir() else [p] for p in found)
+    return [str(path.relative_to(ROOT)) for part in files for path in part]
+
+
+class Selection:
+    """A plugin of pytest that executes selected tests in the given order."""
+
+    def __init__(self, names: Sequence[str]) -> None:
+        self.order = {name: n for n, name in enumerate(names)}
+
+    def pytest_collection_modifyitems(self, items: list[Any]) -> None:
+        """Select and sort."""
+        items[:] = sorted(
+            (item for item in items if item.nodeid in self.order),
+            key=lambda item: self.order[item.nodeid],
+        )
+
+
+class Coverage:
+    """What was recorded: cost and covered lines of each test."""
+
+    def __init__(self, records: Sequence[Path], patience_s: float) -> None:
+        self.cost: dict[str, float] = {}
+        self.lines: dict[str, dict[int, set[str]]] = defaultdict(lambda: defaultdict(set))
+        self.modules: dict[str, None] = {}
+        self.patience_s = patience_s
+        for path in records:
+            kept = json.loads(path.read_text())
+            self.cost |= kept["cost"]
+            self.modules |= dict.fromkeys(kept["modules"])
+            names = [*kept["cost"]]
+            for source, lines in kept["lines"].items():
+                for line, tests in lines.items():
+                    self.lines[source][int(line)].update(names[n] for n in tests)
+
+    def tests(self, mutant: Mutant) -> tuple[list[str], list[str]]:
+        """Return tests that execute the statement: those of the file that mirrors the source, and
+        the others. One case of each function comes before further cases, and the files take turns,
+        each with its cheapest test first, until the time is used up.
+
+        If no test executes the statement, as in compiled functions and in headers of functions, all
+        tests that execute any line of the file are taken.
+        """
+        lines = self.lines[mutant.path]
+        first, last = mutant.lines
+        names = {name for n in range(first, last + 1) for name in lines.get(n, ())}
+        names = names or {name for covering in lines.values() for name in covering}
+        source = Path(mutant.path)
+        mirror = "/".join(["tests", *source.parts[1:-1], f"test_{source.stem}"])
+        taken: Counter[str] = Counter()
+        ranked = []
+        for name in sorted(names, key=lambda n: (self.cost[n], n)):
+            if self.cost[name] < LONGEST_TEST_S:
+                file, function = name.split("::")[0], name.split("[")[0]
+                case, number = taken[function], taken[file]
+                taken[function] += 1
+                taken[file] += case == 0
+                ranked.append((not file.startswith(mirror), case, number, self.cost[name], name))
+        chosen: tuple[list[str], list[str]] = ([], [])
+        total = 0.0
+        for away, *_, cost, name in sorted(ranked):
+            total += cost
+            if total > self.patience_s and total > cost:
+                break
+            chosen[away].append(name)
+        return chosen
+
+
+def execute(parts: Iterable[Sequence[str]]) -> int:
+    """Execute tests in this process, part by part, until one fails."""
+    for part in filter(None, parts):
+        files = sorted({name.split("::")[0] for name in part})
+        if code := pytest.main([*OPTIONS, "-x", *files], plugins=[Selection(part)]):
+            return int(code)
+    return 0
+
+
+def judged(work: Any, limit_s: float, log: Path) -> str:
+    """Return the result of a mutant: `killed`, `timeout` or `survived`."""
+    pid = os.fork()
+    if pid == 0:
+        os.setsid()
+        for stream in (1, 2):
+            os.dup2(os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND), stream)
+        resource.setrlimit(resource.RLIMIT_CPU, (int(limit_s), int(limit_s)))
+        resource.setrlimit(resource.RLIMIT_AS, (8 << 30, 8 << 30))
+        code = FAULT
+        try:
+            code = work()
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            os._exit(code)
+    end, status = time.monotonic() + 4 * limit_s, None
+    while status is None and time.monotonic() < end:
+        done, value = os.waitpid(pid, os.WNOHANG)
+        status = value if done else None
+        time.sleep(0.01)
+    with suppress(ProcessLookupError):
+        os.killpg(pid, signal.SIGKILL)
+    if status is None:
+        os.waitpid(pid, 0)
+        return "timeout"
+    code = os.waitstatus_to_exitcode(status)
+    if code == FAULT:
+        raise RuntimeError(f"the tests could not be executed: {log}")
+    if code in (-signal.SIGKILL, -signal.SIGXCPU):
+        return "timeout"
+    return "survived" if code == 0 else "killed"
+
+
+def _digest(paths: Iterable[Path]) -> str:
+    return hashlib.sha256(b"".join(path.read_bytes() for path in paths)).hexdigest()
+
+
+class Trial:
+    """A copy of the repository in a folder, in which one file at a time is changed."""
+
+    def __init__(self, folder: Path, patience_s: float) -> None:
+        self.copy, self.folder = folder / "copy", folder
+        self._time = int(time.time())
+        self._copy_repository()
+        source = _digest(ROOT / name for name in self._files() if name.startswith("pbdkit/"))
+        records = []
+        for name in test_files():
+            key = hashlib.sha256(f"{source} {_digest([ROOT / name])}".encode()).hexdigest()[:16]
+            target = folder / "records" / f"{name.replace('/', '.')}-{key}.json"
+            if not target.exists():
+                target.parent.mkdir(exist_ok=True)
+                command = [sys.executable, str(Path(__file__)), "--record", name, str(target)]
+                subprocess.run(command, cwd=self.copy, env=self._environment(), check=True)
+            records.append(target)
+        self.coverage = Coverage(records, patience_s)
+
+    def _files(self) -> list[str]:
+        options = ["--cached", "--others", "--exclude-standard"]
+        listed = subprocess.check_output(["git", "ls-files", *options], cwd=ROOT, text=True)
+        return [name for name in listed.splitlines() if (ROOT / name).is_file()]
+
+    def _copy_repository(self) -> None:
+        for name in self._files():
+            source, target = ROOT / name, self.copy / name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            if not target.exists() or source.read_bytes() != target.read_bytes():
+                shutil.copy2(source, target)
+
+    def _environment(self) -> dict[str, str]:
+        kernels = {"PBDKIT_CACHE_DIR": str(self.folder / "kernels"), "CI": "1"}
+        paths = os.pathsep.join([str(self.copy), *filter(None, [os.environ.get("PYTHONPATH")])])
+        return os.environ | kernels | {"PYTHONPATH": paths, "OMP_NUM_THREADS": "1"}
+
+    def prepare(self) -> None:
+        """Import everything that tests use except pbdkit, which the forked processes import."""
+        os.environ.update(self._environment())
+        os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+        sys.dont_write_bytecode = False
+        os.chdir(self.copy)
+        (self.folder / "kernels").mkdir(exist_ok=True)
+        sys.path[:] = [p for p in sys.path if not Path(p or ".").resolve().is_relative_to(ROOT)]
+        sys.path.insert(0, str(self.copy))
+        for name in self.coverage.modules:
+            with suppress(Exception):
+                importlib.import_module(name)
+        assert not any(name.split(".")[0] == "pbdkit" for name in sys.modules)
+        gc.collect()
+        gc.freeze()
+
+    def check(self) -> None:
+        """Raise RuntimeError unless the cheapest tests pass without any change."""
+        tests = sorted(self.coverage.cost, key=lambda name: self.coverage.cost[name])[:20]
+        if self._judged([tests]) != "survived":
+            raise RuntimeError(f"the tests fail without any change: {self.folder / 'log'}")
+
+    def result(self, mutant: Mutant) -> tuple[str, float]:
+        """Return the result of a mutant, and the processor time."""
+        path = self.copy / mutant.path
+        original = path.read_text()
+        begun = resource.getrusage(resource.RUSAGE_CHILDREN)
+        try:
+            self._write(path, mutant.code())
+            verdict = self._judged(self.coverage.tests(mutant))
+        finally:
+            self._write(path, original)
+        ended = resource.getrusage(resource.RUSAGE_CHILDREN)
+        spent = ended.ru_utime + ended.ru_stime - begun.ru_utime - begun.ru_stime
+        return verdict, spent
+
+    def _judged(self, parts: Sequence[Sequence[str]]) -> str:
+        """Execute tests with kernels of their own."""
+        kernels, log = self.folder / "kernels-of-mutant", self.folder / "log"
+        shutil.rmtree(kernels, ignore_errors=True)
+        shutil.copytree(self.folder / "kernels", kernels, copy_function=os.link)
+        os.environ["PBDKIT_CACHE_DIR"] = str(kernels)
+        log.unlink(missing_ok=True)
+        limit = 30.0 + 4 * sum(self.coverage.cost[name] for part in parts for name in part)
+        return judged(lambda: execute(parts), limit, log)
+
+    def _write(self, path: Path, text: str) -> None:
+        """Write a file with a time of its own, so that no older bytecode counts as valid."""
+        path.write_text(text)
+        self._time += 2
+        os.utime(path, (self._time, self._time))
+
+
+def report(results: dict[Mutant, str]) -> bool:
+    """Print the table, and return whether the goal is met."""
+    print("\narea | mutants | killed | by timeout | survived")
+    counts: dict[str, Counter[str]] = defaultdict(Counter)
+    for mutant, verdict in results.items():
+        counts[mutant.area][verdict] += 1
+        counts["all"][verdict] += 1
+    for area in [*(a for a in AREAS if a in counts), "all"]:
+        c = counts[area]
+        killed = c["killed"] + c["timeout"]
+        print(f"{area} | {c.total()} | {killed} | {c['timeout']} | {c['survived']}")
+    for mutant in sorted(m for m, verdict in results.items() if verdict == "survived"):
+        print(mutant.name)
+    share = 1 - counts["all"]["survived"] / max(1, counts["all"].total())
+    print(f"killed: {share:.1%}; goal {GOAL:.0%}")
+    return share >= GOAL
+
+
+def main() -> int:
+    """Draw mutants, execute the tests, and report."""
+    parser = argparse.ArgumentParser(description="Mutation testing of pbdkit.")
+    parser.add_argument("--count", type=int, default=500)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--area", choices=[*AREAS], action="append", help="default: all")
+    parser.add_argument("--folder", type=Path, default=ROOT / "build" / "mutants")
+    parser.add_argument("--patience", type=float, default=20.0, help="seconds of tests per mutant")
+    parser.add_argument("--again", action="store_true", help="only earlier survivors")
+    parser.add_argument("--show", action="store_true", help="print the mutants, execute nothing")
+    parser.add_argument("--record", nargs=2, metavar=("FILE", "TARGET"), help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    if options.record:
+        record(options.record[0], Path(options.record[1]))
+        return 0
+    options.folder.mkdir(parents=True, exist_ok=True)
+    mutants = drawn(options.count, options.seed, options.area or [*AREAS])
+    kept = options.folder / "results.json"
+    earlier = json.loads(kept.read_text()) if kept.exists() else {}
+    if options.show:
+        for mutant in mutants:
+            print(mutant.name)
+        return 0
+    trial = Trial(options.folder.resolve(), options.patience)
+    trial.prepare()
+    trial.check()
+    results = {}
+    for mutant in mutants:
+        key = hashlib.sha256(mutant.code().encode()).hexdigest()
+        verdict = earlier.get(key)
+        if verdict is None or (options.again and verdict == "survived"):
+            verdict, spent = trial.result(mutant)
+            print(f"{mutant.area} | {mutant.name} | {verdict} | {spent:.1f} s", flush=True)
+            earlier[key] = verdict
+            kept.write_text(json.dumps(earlier, indent=0))
+        results[mutant] = verdict
+    return 0 if report(results) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
