@@ -83,6 +83,13 @@ def gpu(session: nox.Session) -> None:
     session.run("pytest", "-n", "auto", "tests/stepping/test_cuda_engine.py")
 
 
+@nox.session(default=False)
+def mutants(session: nox.Session) -> None:
+    """Mutation testing, 500 changes; fewer: `nox -s mutants -- --count 60 --area contact`."""
+    install(session, "nightly")
+    session.run("python", "tests/reliability/mutants.py", *session.posargs)
+
+
 @nox.session
 def docs(session: nox.Session) -> None:
     """The documentation site, in build/docs; a warning is an error. `nox -s docs -- unrun` leaves

@@ -534,18 +534,18 @@ class Trial:
 
 
 def report(results: dict[Mutant, str]) -> bool:
-    """Print the table, and return whether the goal is met."""
-    print("\narea | mutants | killed | by timeout | survived")
+    """Print survivors and the table, and return whether the goal is met."""
+    for mutant in sorted(m for m, verdict in results.items() if verdict == "survived"):
+        print(f"survived: {mutant.name}")
     counts: dict[str, Counter[str]] = defaultdict(Counter)
     for mutant, verdict in results.items():
         counts[mutant.area][verdict] += 1
         counts["all"][verdict] += 1
+    print("area | mutants | killed | of these by timeout | survived")
     for area in [*(a for a in AREAS if a in counts), "all"]:
-        c = counts[area]
-        killed = c["killed"] + c["timeout"]
-        print(f"{area} | {c.total()} | {killed} | {c['timeout']} | {c['survived']}")
-    for mutant in sorted(m for m, verdict in results.items() if verdict == "survived"):
-        print(mutant.name)
+        number = counts[area]
+        killed = number["killed"] + number["timeout"]
+        print(f"{area} | {number.total()} | {killed} | {number['timeout']} | {number['survived']}")
     share = 1 - counts["all"]["survived"] / max(1, counts["all"].total())
     print(f"killed: {share:.1%}; goal {GOAL:.0%}")
     return share >= GOAL
