@@ -131,7 +131,7 @@ TEXT_FOLDERS = ("numba_engine", "stepping")
 LONGEST_TEST_S = 8.0
 """Processor time above which a test is not executed."""
 OPTIONS = ["-q", "-p", "no:cacheprovider", "-o", "addopts="]
-"""Options of pytest."""
+"""Options of pytest, without those of the project."""
 OPTIONS += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]  # Packages are already imported.
 GOAL = 0.9
 FAULT = 70
@@ -179,7 +179,7 @@ class Mutant(NamedTuple):
 
     @property
     def name(self) -> str:
-        """Place and operator."""
+        """Identify the mutant by its place and operator."""
         return f"{self.path}:{self.line}:{self.operator}:{self.occurrence}"
 
     def code(self) -> str:
@@ -340,7 +340,7 @@ class Selection:
         self.order = {name: n for n, name in enumerate(names)}
 
     def pytest_collection_modifyitems(self, items: list[Any]) -> None:
-        """Select and sort."""
+        """Keep the selected tests, in their order."""
         items[:] = sorted(
             (item for item in items if item.nodeid in self.order),
             key=lambda item: self.order[item.nodeid],
@@ -348,7 +348,7 @@ class Selection:
 
 
 class Coverage:
-    """What was recorded: cost and covered lines of each test."""
+    """Processor time and covered lines of each test, as recorded."""
 
     def __init__(self, records: Sequence[Path], patience_s: float) -> None:
         self.cost: dict[str, float] = {}
@@ -558,7 +558,7 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--area", choices=[*AREAS], action="append", help="default: all")
     parser.add_argument("--folder", type=Path, default=ROOT / "build" / "mutants")
-    parser.add_argument("--patience", type=float, default=20.0, help="seconds of tests per mutant")
+    parser.add_argument("--patience", type=float, default=30.0, help="seconds of tests per mutant")
     parser.add_argument("--again", action="store_true", help="only earlier survivors")
     parser.add_argument("--show", action="store_true", help="print the mutants, execute nothing")
     parser.add_argument("--record", nargs=2, metavar=("FILE", "TARGET"), help=argparse.SUPPRESS)

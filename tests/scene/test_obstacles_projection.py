@@ -1,0 +1,127 @@
+"""The nearest place outside obstacles, against dense samples of their outlines.
+
+The samples of all outlines that lie outside every obstacle are places to which the particle could
+be moved. None of them may be nearer, in the metric of the particle, than the computed place.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pbdkit.model.boundary_conditions import Obstacle
+from pbdkit.scene.obstacles import Outline, Walls, contact_correction, outline_of
+
+SHAPES: dict[str, dict[str, Any]] = {
+    "disc": {"type": "disc", "radius": 2.0, "centre": [0.2, 0.1]},
+    "second disc": {"type": "disc", "radius": 1.5, "centre": [2.0, 2.2]},
+    "half-plane": {"half_plane": {"point": [0.0, -1.2], "normal": [0.3, 1.0]}},
+    "rectangle": {"type": "rectangle", "width": 2.4, "height": 2.1, "origin": [1.1, -0.6]},
+    "arrow": {"type": "polygon", "vertices": [[-3.0, 0.0], [0.5, 3.1], [-1.1, 0.2], [0.4, -2.0]]},
+}
+METRICS = {
+    "isotropic": [1.0, 0.0, 1.0],
+    "along x": [1.6, 0.0, 0.7],
+    "inclined": [1.2, 0.45, 0.8],
+}
+"""Compliances (xx, xy, yy)."""
+FAR, FINENESS = 8.0, 1e-2
+
+
+def outline(name: str) -> Outline:
+    return outline_of(Obstacle(shape=SHAPES[name]).shape)
+
+
+def samples(name: str) -> Any:
+    """Points of the outline, (point, axis), with a distance of at most FINENESS."""
+    shape = SHAPES[name]
+    if "half_plane" in shape:
+        point, (a, b) = shape["half_plane"]["point"], shape["half_plane"]["normal"]
+        t = np.arange(-FAR, FAR, FINENESS)
+        return np.array(point) + t[:, None] * np.array([-b, a]) / np.hypot(a, b)
+    if shape["type"] == "disc":
+        angle = np.arange(0.0, 2 * np.pi, FINENESS / shape["radius"])
+        return shape["centre"] + shape["radius"] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    corners = np.array(shape.get("vertices", []))
+    if shape["type"] == "rectangle":
+        x, y = shape["origin"]
+        w, h = shape["width"], shape["height"]
+        corners = np.array([(x, y), (x + w, y), (x + w, y + h), (x, y + h)])
+    t = np.arange(0.0, 1.0, FINENESS / 6.0)[:, None]
+    edges = zip(corners, np.roll(corners, -1, axis=0), strict=True)
+    return np.concatenate([a + t * (b - a) for a, b in edges])
+
+
+def places(count: int) -> Any:
+    return np.random.default_rng(7).uniform([-2.0, -2.0], [3.5, 3.0], (count, 2)).T
+
+
+def squared(w: Any, C: Any) -> Any:
+    """w·S w with S = C⁻¹, for displacements in the last axis."""
+    S = np.linalg.inv([[C[0], C[1]], [C[1], C[2]]])
+    return np.einsum("...a,ab,...b->...", w, S, w)
+
+
+def tolerance(C: Any, square: Any) -> Any:
+    """Largest difference between the square of the nearest place and that of the nearest sample."""
+    worst = np.linalg.norm(np.linalg.inv([[C[0], C[1]], [C[1], C[2]]]), 2)
+    return 2.0 * worst * FINENESS * np.sqrt(square) + FINENESS**2 * worst
+
+
+@pytest.mark.parametrize("metric", METRICS)
+@pytest.mark.parametrize("name", SHAPES)
+def test_no_point_of_an_outline_is_nearer(name: str, metric: str) -> None:
+    wall, at, C = outline(name), places(300), np.array(METRICS[metric])
+    depth = -wall.facing(*at)[0]
+    # Near the centre of a disc, several points of its outline are nearly equally near.
+    at = at[:, (depth > 0.0) & ~(depth > 0.3 * SHAPES[name].get("radius", np.inf))]
+    w = wall.outline_correction(at, np.repeat(C[:, None], at.shape[1], axis=1)).T
+    assert len(w) > 20
+    np.testing.assert_allclose(wall.facing(*(at + w.T))[0], 0.0, atol=1e-9)
+    nearest = np.array([squared(samples(name) - x, C).min() for x in at.T])
+    assert (squared(w, C) <= nearest + 1e-9).all()
+    assert (squared(w, C) >= nearest - tolerance(C, nearest)).all()
+
+
+@pytest.mark.parametrize("metric", METRICS)
+def test_no_free_point_of_several_outlines_is_nearer(metric: str) -> None:
+    names = [*SHAPES]
+    outlines, C = [outline(name) for name in names], np.array(METRICS[metric])
+    walls = Walls.of(outlines)
+    points = np.concatenate([samples(name) for name in names])
+    points = points[np.min([o.facing(*points.T)[0] for o in outlines], axis=0) > -1e-9]
+    several = 0
+    with np.errstate(all="ignore"):
+        for at in places(36).T:
+            inside = sum(o.facing(*at[:, None])[0][0] < 0.0 for o in outlines)
+            w = np.array(contact_correction(*at, *C, 0, *walls))
+            if not inside:
+                assert not w.any()
+                continue
+            several += inside > 1
+            assert walls.clearance(*(at + w)) >= 0.0
+            assert squared(w, C) <= squared(points - at, C).min() + 1e-9
+    assert several > 4
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_a_guided_particle_moves_to_the_nearest_free_place_on_its_line(axis: int) -> None:
+    """`axis` is led, and the particle is free along the other one."""
+    outlines = [outline(name) for name in ("disc", "second disc", "rectangle", "arrow")]
+    walls = Walls.of(outlines)
+    along = np.arange(-FAR, FAR, FINENESS)
+    step = np.zeros((2, len(along)))
+    step[1 - axis] = along
+    moved = 0
+    with np.errstate(all="ignore"):
+        for at in places(50).T:
+            w = np.array(contact_correction(*at, 1.2, 0.45, 0.8, axis + 1, *walls))
+            free = np.min([o.facing(*(at[:, None] + step))[0] for o in outlines], axis=0) >= 0.0
+            assert w[axis] == 0.0
+            assert walls.clearance(*(at + w)) >= 0.0
+            nearest = np.abs(along[free]).min()
+            assert abs(abs(w[1 - axis]) - nearest) <= FINENESS
+            moved += w.any()
+    assert moved > 20
