@@ -241,7 +241,7 @@ def test_changes_since_the_start_are_refused(
 CONTINUED = ["plain", "everything", "memory", "fracture", "small records", "zlib", "settles"]
 
 
-@pytest.mark.parametrize("change", CONTINUED)
+@pytest.mark.parametrize("change", in_turn(CONTINUED, 2))
 def test_finished_run_is_extended_to_the_longer_one(
     change: str, tensile: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -358,12 +358,13 @@ class Surroundings:
 
     def _torn(self, state: State) -> dict[Slot, Torn] | None:
         """Return the damage beside each slot; None if nothing is damaged."""
+        softens = isinstance(self._scene.experiment.fracture, (Softens, SoftensCells))
+        assert state.broken_step is not None
+        if not softens and state.broken_step.max(initial=-1) < 0:
+            return None
         around = self._scene.neighbourhood.cells_around[self._sublattice]
-        damage = {
-            (bond.plane, bond.owner): self._damage(bond, state)
-            for cell in around.cells
-            for bond in cell
-        }
+        bonds = {(bond.plane, bond.owner): bond for cell in around.cells for bond in cell}
+        damage = {key: self._damage(bond, state) for key, bond in bonds.items()}
         if not any(np.any(values) for both in damage.values() for values in both):
             return None
         largest = [

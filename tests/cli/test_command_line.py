@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 import xarray
+from scene_strategies import in_turn
 
 import pbdkit
 from pbdkit.cli import FIRST
@@ -371,7 +372,7 @@ NEEDED = {
 are not."""
 
 
-@pytest.mark.parametrize(("asked", "needed"), NEEDED.items(), ids=NEEDED)
+@pytest.mark.parametrize(("asked", "needed"), in_turn(NEEDED.items(), 2), ids=in_turn(NEEDED, 2))
 @pytest.mark.usefixtures("call")  # its folder
 def test_unused_modules_are_not_imported(asked: str, needed: tuple[set[str], set[str]]) -> None:
     start = asked if asked.startswith("import") else HELP.replace("['--help']", str(asked.split()))

@@ -62,7 +62,7 @@ SET = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("words", "expected"), SET.values(), ids=SET)
+@pytest.mark.parametrize(("words", "expected"), in_turn(SET.values(), 2), ids=in_turn(SET, 2))
 def test_settings(offered: Offered, words: list[str], expected: list[str]) -> None:
     assert offered(*words) == expected
 

@@ -53,7 +53,7 @@ def test_every_open_interface_is_available() -> None:
     assert sorted(OFFERED) == sorted(i.__name__ for i in INTERFACES.values())
 
 
-@pytest.mark.parametrize("interface", OFFERED)
+@pytest.mark.parametrize("interface", in_turn(OFFERED, 2))
 def test_project_runs_unchanged(new: New, call: Call, interface: str) -> None:
     folder = new("pbdkit-brand-new", interface)
     assert listed(call)["pbdkit-brand-new"]["state"] == "ok"
@@ -74,7 +74,7 @@ def test_bonds_break_in_the_example_of_a_fracture_model(new: New) -> None:
     assert 0 < broken.sum() < broken.size
 
 
-@pytest.mark.parametrize("interface", OFFERED)
+@pytest.mark.parametrize("interface", in_turn(OFFERED, 2))
 def test_project_passes_conformance(new: New, interface: str) -> None:
     new("pbdkit-brand-new", interface)
     kind = next(i for i in INTERFACES.values() if i.__name__ == interface)

@@ -9,6 +9,7 @@ import pbdkit
 from pbdkit.io.snapshot import StateMoment, Tables
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.followers import SlotFollowers
+from pbdkit.stepping.rule_evaluation import Surroundings, blocks
 from pbdkit.stepping.state import initial_state
 
 SQUARES = {"type": "chebyshev", "shells": 1}
@@ -121,6 +122,25 @@ CRACKED = {
     "solver": {"type": "equilibrium"},
     "steps": 1,
 }
+
+
+def test_damage_is_computed_once_for_each_bond_and_only_in_damaged_bodies(monkeypatch):
+    torn = {"type": "strain", "failure": 0.1}
+    parts = {"body": {"type": "grid", "columns": 5, "rows": 4}, "rule": RULES[1], "fracture": torn}
+    scene = build_scene(pbdkit.Experiment(**CRACKED | parts))
+    state, computed, damage_of = initial_state(scene), [], Surroundings._damage
+
+    def damage(self, bond, state):
+        computed.append((bond.plane, bond.owner))
+        return damage_of(self, bond, state)
+
+    monkeypatch.setattr(Surroundings, "_damage", damage)
+    (surroundings,) = blocks(scene)
+    assert all(to.torn is None for to in surroundings.neighbours(state))
+    assert computed == []
+    state.broken_step[0] = np.where(state.broken_step[0] < 0, 0, state.broken_step[0])
+    assert all(to.torn for to in surroundings.neighbours(state))
+    assert len(computed) == len(set(computed)) > 4
 
 
 @pytest.mark.parametrize("rule", [*RULES[1:5], ORTHOTROPIC], ids=lambda rule: str(rule)[:45])

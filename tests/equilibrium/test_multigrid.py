@@ -7,6 +7,7 @@ from typing import ClassVar, Literal
 import numpy as np
 import pytest
 from interpreted_kernels import interpreting
+from scene_strategies import in_turn
 from turning_frame import Turning
 
 import pbdkit
@@ -111,7 +112,7 @@ def solved(given, method="multigrid", tolerance=1e-8):
     return found.u.values[-1], json.loads(found.attrs["certificate"])
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", in_turn(SCENES, 2))
 def test_few_iterations_reach_the_error_bound(name):
     """The error bound is never below the true error, and near it; it is the same in a second run,
     to the bit."""
@@ -137,7 +138,7 @@ MORE = {
 }
 
 
-@pytest.mark.parametrize("name", [*SCENES, *MORE])
+@pytest.mark.parametrize("name", in_turn([*SCENES, *MORE], 2))
 def test_without_numba_bilinear_grids_are_used(name, monkeypatch):
     given = (SCENES | MORE)[name]
     exact, _ = solved(given, "lu", 1e-11)

@@ -16,6 +16,7 @@ from property_cases import (
     pull_right,
     scene_of,
 )
+from scene_strategies import in_turn
 
 import pbdkit
 
@@ -51,7 +52,10 @@ def stretched(lattice, neighbours, stretch):
 
 @pytest.mark.parametrize(
     ("lattice", "neighbours", "rule"),
-    all_pairs(LATTICES, ["coordination-1", "chebyshev-1"], ["barycentre", "mean-displacement"]),
+    in_turn(
+        all_pairs(LATTICES, ["coordination-1", "chebyshev-1"], ["barycentre", "mean-displacement"]),
+        2,
+    ),
 )
 def test_affine_leaders_all_round_give_an_affine_interior(lattice, neighbours, rule):
     parts = {"lattice": lattice, "neighbours": neighbours, "rule": rule}
@@ -67,7 +71,7 @@ def test_affine_leaders_all_round_give_an_affine_interior(lattice, neighbours, r
     np.testing.assert_allclose(u[body.body_rows], expected[body.body_rows], rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("stretch", [0.4, 0.9, 9.0])
+@pytest.mark.parametrize("stretch", in_turn([0.4, 0.9, 9.0], 2))
 @sheets
 def test_case_1_the_equilibrium_of_a_stretched_sheet_is_affine(lattice, neighbours, stretch):
     parts, inside, expected, leaders = stretched(lattice, neighbours, stretch)
@@ -76,7 +80,7 @@ def test_case_1_the_equilibrium_of_a_stretched_sheet_is_affine(lattice, neighbou
     assert not u[:, 1].any()
 
 
-@pytest.mark.parametrize("through", [1.001, 1.2, 3.0])
+@pytest.mark.parametrize("through", in_turn([1.001, 1.2, 3.0], 2))
 @sheets
 def test_case_2_an_inverted_sheet_has_signed_area_and_a_warning(lattice, neighbours, through):
     parts, _, _, leaders = stretched(lattice, neighbours, -through)

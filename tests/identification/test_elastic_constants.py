@@ -21,6 +21,7 @@ from identity_cases import (
     shells,
 )
 from property_cases import LATTICES, NEIGHBOURS, advanced, body_sites
+from scene_strategies import in_turn
 
 import pbdkit
 from pbdkit.identification.waves import operator, slow_waves
@@ -321,7 +322,7 @@ def test_averaging_spreads_by_half_the_mean_square_of_the_offsets(lattice, neigh
     np.testing.assert_allclose(found.long.diffusivity, tensor, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", shipped_names())
+@pytest.mark.parametrize("name", in_turn(shipped_names(), 3))
 def test_every_shipped_experiment_has_an_identity(name):
     found = pbdkit.identify(name)
     assert (found.kind == "neither") == bool(found.reasons)

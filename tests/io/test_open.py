@@ -10,6 +10,7 @@ from typing import Any
 import netCDF4
 import numpy as np
 import pytest
+from scene_strategies import in_turn
 
 import pbdkit
 from pbdkit.untrusted_files import try_reading
@@ -93,7 +94,7 @@ REFUSED = ["no position", "positions not finite", "bonds of nobody", "no JSON", 
 
 
 @pytest.mark.usefixtures("read_once")
-@pytest.mark.parametrize("name", CRAFTED)
+@pytest.mark.parametrize("name", in_turn(CRAFTED, 2))
 def test_crafted_file_is_plotted_or_refused_in_one_line(name: str, sound: Path, call: Call) -> None:
     shutil.copy(sound, "crafted.nc")
     with netCDF4.Dataset("crafted.nc", "a") as file:
@@ -112,7 +113,7 @@ def test_crafted_file_is_plotted_or_refused_in_one_line(name: str, sound: Path, 
 
 
 @pytest.mark.usefixtures("read_once")
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", in_turn(range(12), 2))
 def test_file_with_overwritten_bytes_is_read_or_refused(seed: int, sound: Path, call: Call) -> None:
     random, damaged = np.random.default_rng(seed), bytearray(sound.read_bytes())
     begin = int(random.integers(len(damaged)))

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from scene_strategies import in_turn
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -72,7 +73,7 @@ def left_out(scene):
     return [warning for warning in scene.warnings if "omitted" in warning]
 
 
-@pytest.mark.parametrize("name", LATTICES)
+@pytest.mark.parametrize("name", in_turn(LATTICES, 2))
 @pytest.mark.parametrize("angle", [0.0, 90.0, 33.0])
 @pytest.mark.parametrize("width", [0.1, 0.3, 0.9, 1.5])
 @pytest.mark.parametrize("middle", [(5.0, 4.9), (5.3, 5.2)])

@@ -150,7 +150,7 @@ SHAPES = {
 }
 
 
-@pytest.mark.parametrize("name", SHAPES)
+@pytest.mark.parametrize("name", in_turn(SHAPES, 2))
 def test_partitions_of_every_shape(name, tmp_path):
     given_, size = SHAPES[name]
     compare(given_, tmp_path, size)
@@ -307,7 +307,7 @@ def test_strips_divide_every_grid():
             strips = [s.coarser(1) for s in strips]
 
 
-@pytest.mark.parametrize("sizes", [(3, 2), (1, 3), (2, 1)])
+@pytest.mark.parametrize("sizes", in_turn([(3, 2), (2, 1), (1, 3)], 2))
 def test_interrupted_and_resumed_on_another_number_of_processes(sizes, tmp_path):
     given_ = strip(**CASES["released on the way"])
     one, several = tmp_path / "one.nc", tmp_path / "several.nc"

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from interpreted_kernels import interpreting
 from jsonschema import Draft202012Validator
+from scene_strategies import in_turn
 from scipy.stats import norm
 
 import pbdkit
@@ -149,15 +150,17 @@ COHESIVE = {"type": "cohesive", "energy": ASKED | {"mean": 4e-6}, "onset": ASKED
 
 @pytest.mark.parametrize(
     "parts",
-    [
+    in_turn([
         STIFFNESS,
         {"fracture": {"type": "damage", "onset": ASKED, "failure": ASKED | {"mean": 0.2}}},
         {"lattice": {"type": "hexagonal", "a": 1.0}, "neighbours": {"type": "coordination"}},
         {"rule": {"type": "elastic", "poisson_ratio": ASKED | {"mean": 0.2}}},
         {"rule": ELASTIC, "fracture": COHESIVE},
         {"rule": ELASTIC, "fracture": {"type": "none"}, "solver": {"type": "equilibrium"}},
-    ],
-    ids=["stiffness", "damage", "hexagonal", "poisson ratio", "cohesive", "equilibrium"],
+    ], 2),
+    ids=in_turn(
+        ["stiffness", "damage", "hexagonal", "poisson ratio", "cohesive", "equilibrium"], 2
+    ),
 )  # fmt: skip
 def test_random_field_equals_a_grid_of_its_values(parts):
     written = pbdkit.Experiment(**GIVEN | parts).model_dump(mode="json")

@@ -4,6 +4,7 @@ from typing import ClassVar, Literal
 
 import numpy as np
 import pytest
+from scene_strategies import in_turn
 
 import pbdkit
 from pbdkit.scene.scene import build_scene
@@ -90,7 +91,7 @@ def membrane_moves(scene, u):
     return moves
 
 
-@pytest.mark.parametrize("frame", FRAMES)
+@pytest.mark.parametrize("frame", in_turn(FRAMES, 2))
 def test_steps_converge_to_the_equilibrium(frame):
     stepped = pbdkit.run(
         plate(frame, *SMALL, "solver.memory=0.8", "steps=1200", "record.at=[0, 1200]"),

@@ -165,7 +165,7 @@ def test_each_step_equals_a_scene_with_the_values_at_its_end(name):
     assert state.broken_step is None or (state.broken_step > 0).any()
 
 
-@pytest.mark.parametrize("name", COMPILED)
+@pytest.mark.parametrize("name", in_turn(COMPILED, 2))
 def test_kernels_follow_schedules_bit_for_bit(name, compiled_at_length):
     """`stepping/numba_engine/test_engine` compiles one that has several."""
     parts = CHANGING[name]

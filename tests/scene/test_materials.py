@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from finite_elements.inclusion import jumps, plate
 from interpreted_kernels import interpreting
+from scene_strategies import in_turn
 from shapely import Polygon
 
 import pbdkit
@@ -172,7 +173,7 @@ FIELDS: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("parts", FIELDS.values(), ids=FIELDS)
+@pytest.mark.parametrize("parts", in_turn(FIELDS.values(), 2), ids=in_turn(FIELDS, 2))
 def test_engines_agree_and_the_dataset_is_complete(parts):
     given = {
         "name": "composite",

@@ -153,7 +153,7 @@ INTO_A_CORNER = {
 
 
 @pytest.mark.parametrize(
-    ("rule", "slant"), [(SPRINGS, 0.0), (ELASTIC, 0.2), (SPRINGS, 0.5), (ELASTIC, 0.5)]
+    ("rule", "slant"), in_turn([(SPRINGS, 0.0), (SPRINGS, 0.5), (ELASTIC, 0.5), (ELASTIC, 0.2)], 2)
 )
 def test_corner_between_obstacles_constrains_both_normals(rule: Any, slant: float) -> None:
     """A symmetric block that is pushed into it, whatever their order and however it gets there."""

@@ -23,13 +23,16 @@ from property_cases import (
     pull_right,
     scene_of,
 )
+from scene_strategies import in_turn
 
 import pbdkit
 from pbdkit.stepping import bond_breaking, rule_evaluation
 
 few = settings(max_examples=4, deadline=None, derandomize=True)
 small = st.floats(-2.0, 2.0, allow_subnormal=False)
-combinations = pytest.mark.parametrize(("lattice", "neighbours"), LATTICES_AND_NEIGHBOURS)
+combinations = pytest.mark.parametrize(
+    ("lattice", "neighbours"), in_turn(LATTICES_AND_NEIGHBOURS, 3)
+)
 every_rule = pytest.mark.parametrize("rule", RULES)
 
 
@@ -217,7 +220,7 @@ FRACTURE = {"type": "threshold", "thresholds": [2.4]}
 
 
 @pytest.mark.parametrize(
-    ("lattice", "rule", "fracture"), all_pairs(LATTICES, RULES, [None, FRACTURE])
+    ("lattice", "rule", "fracture"), in_turn(all_pairs(LATTICES, RULES, [None, FRACTURE]), 2)
 )
 def test_repeated_runs_and_any_row_blocks_agree_bitwise(lattice, rule, fracture, monkeypatch):
     leaders = [HOLD_LEFT, pull_right(0.7, 0.1)]

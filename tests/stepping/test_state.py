@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from property_cases import pull_right
 from remembering_parts import Tiring, Weakest
+from scene_strategies import in_turn
 
 import pbdkit
 from pbdkit.scene.scene import build_scene
@@ -58,7 +59,7 @@ def force_of_a_chain(extension):
     return ONSET * (FAILURE - extension) / (FAILURE - peak)
 
 
-@pytest.mark.parametrize("extension", [0.3, 0.7, 0.95])
+@pytest.mark.parametrize("extension", in_turn([0.3, 0.7, 0.95], 2))
 @pytest.mark.parametrize("way", ["steps", "equilibrium"])
 def test_a_chain_with_a_weak_bond_follows_the_exact_law(extension, way):
     # The others would soften later: the weak one leads from the peak on.
