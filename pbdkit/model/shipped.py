@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from copy import deepcopy
+from functools import lru_cache
 from itertools import takewhile
 from pathlib import Path
 
@@ -88,10 +90,16 @@ def read_experiment(name: str, *, allow_outside: bool = False) -> Source:
         return source
     names = shipped_names()
     if name in names:
-        source = read_text(shipped_text(name), name)
+        source = deepcopy(_parsed(shipped_text(name), name))
         source.files = FileResolver((FOLDER / name).parent)
         return source
     what = "is a folder" if is_folder else "is neither a file nor a shipped experiment"
     near = [str(p) for p in path.parent.glob("*.yaml")] if path.parent.is_dir() else []
     hint = did_you_mean(name, [*near, *names])
     raise ExperimentError(f"{name}: {what}{hint} (`pbdkit experiments` lists them)")
+
+
+@lru_cache(maxsize=64)
+def _parsed(text: str, name: str) -> Source:
+    """Return the source of a shipped experiment. Copying it is faster than parsing the text."""
+    return read_text(text, name)

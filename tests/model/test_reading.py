@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 
 import pbdkit
-from pbdkit.model.reading import EXPERIMENT, FIT, PARTS, SWEEP, kind_of
+from pbdkit.model import shipped
+from pbdkit.model.reading import EXPERIMENT, FIT, PARTS, SWEEP, kind_of, read_text
 from pbdkit.model.shipped import read_experiment, shipped_names
 
 TAKES_EXPERIMENTS = ["run", "check", "identify", "bench"]
@@ -143,3 +144,18 @@ def test_intended_kind_of_a_faulty_file_is_recognised() -> None:
 
 def test_every_key_of_an_experiment_is_listed() -> None:
     assert {*pbdkit.Experiment.known_keys()} == PARTS
+
+
+def test_shipped_experiment_is_parsed_once_and_copied(monkeypatch: pytest.MonkeyPatch) -> None:
+    shipped._parsed.cache_clear()
+    parsed: list[Any] = []
+    monkeypatch.setattr(shipped, "read_text", lambda *text: parsed.append(text) or read_text(*text))
+    first = read_experiment("paper/a")
+    places, steps = dict(first.places), first.data["steps"]
+    first.data["steps"] = first.data["lattice"]["a"] = -1
+    first.places.clear()
+    again = read_experiment("paper/a")
+    assert len(parsed) == 1
+    assert (again.data["steps"], again.places) == (steps, places)
+    assert again.data["lattice"]["a"] > 0
+    assert again.files.folder == first.files.folder
