@@ -38,7 +38,6 @@ from pbdkit.fitting.observations import (
 from pbdkit.fitting.problem import Loss
 from pbdkit.model.experiment import Experiment, Version
 from pbdkit.model.loading import Base, base_source
-from pbdkit.model.motions import read_columns
 from pbdkit.model.reading import (
     FIT,
     OF_PROGRAM,
@@ -50,7 +49,7 @@ from pbdkit.model.reading import (
 )
 from pbdkit.model.schema import DIALECT
 from pbdkit.model.solver import Equilibrium
-from pbdkit.model.validation import closed_part, fault, report
+from pbdkit.model.validation import closed_part, fault, read_columns, report
 from pbdkit.plugin.component import Component, Strict
 from pbdkit.scene.scene import Scene, build_scene
 

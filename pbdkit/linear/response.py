@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pbdkit.array_types import Floats, Indices
 from pbdkit.lattice.raster import EMPTY, Places, slot_step
 from pbdkit.linear.stencil import SMALL, array_of, derivative
-from pbdkit.plugin import Here, Slot, Softens, SoftensCells, Vector
+from pbdkit.plugin import Here, Slot, Softens, SoftensCells, UsesAngles, Vector
 from pbdkit.plugin.discovery import errors_attributed_to
 from pbdkit.plugin.vector import vector
 from pbdkit.scene.scene import Scene
@@ -274,6 +274,8 @@ class _Followers:
         Only one contribution changes if one neighbour is displaced.
         """
         axes = len(self._local.u)
+        if isinstance(self._evaluator.rule, UsesAngles):
+            return self._totals_of_pairs(step)
         # The contribution of a slot is evaluated for no displacement, and for displacements of the
         # particle and of the neighbour.
         count = 1 + 2 * axes
@@ -294,6 +296,20 @@ class _Followers:
                 for d, to in self._neighbours
             ]
             return tuple(self._total(values, 1 + axes) for values in zip(*parts, strict=True))
+
+    def _totals_of_pairs(self, step: complex) -> Contributions:
+        """Return the sums over the neighbours and their pairs after each displacement. All
+        contributions are evaluated for all displacements, because a displaced neighbour belongs to
+        several pairs."""
+        axes, steps = len(self._local.u), self._shape[0]
+        own_step = self._steps(step, 1, steps)
+        differences = [
+            d + (self._steps(step, 1 + axes * (1 + n), steps) - own_step)
+            for n, (d, _) in enumerate(self._neighbours)
+        ]
+        neighbours = [to for _, to in self._neighbours]
+        with np.errstate(all="ignore"):
+            return self._evaluator.total(differences, self._local.u + own_step, neighbours)
 
     def _total(self, by_slot: Sequence[Any], common: int) -> Any:
         """Return the totals of one number or vector, given its contributions for each slot."""

@@ -31,7 +31,7 @@ from pbdkit.plugin.discovery import errors_attributed_to
 from pbdkit.plugin.lattice import Index
 from pbdkit.plugin.vector import vector
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.rule_evaluation import Evaluator, summed
+from pbdkit.stepping.rule_evaluation import Evaluator
 
 NO_REMEDY = "; no relaxation makes it stable: check the rule, and keep |memory| below 1"
 """End of the message about a bound if no relaxation is stable."""
@@ -109,9 +109,8 @@ def move(scene: Scene, slots: Sequence[Slot], difference: Callable[[Slot], Any],
         Place of the particle and its displacement.
     """
     evaluator = Evaluator(scene)
-    neighbours = zip(slots, evaluator.everywhere(slots), strict=True)
-    parts = [(evaluator.contribution(difference(s), here.u, to), None) for s, to in neighbours]
-    return evaluator.move(summed(parts), here._replace(own=evaluator.initial_own()))
+    total = evaluator.total([*map(difference, slots)], here.u, evaluator.everywhere(slots))
+    return evaluator.move(total, here._replace(own=evaluator.initial_own()))
 
 
 def _derivatives(scene: Scene, slots: Sequence[Slot], at: Here) -> Floats:

@@ -3,33 +3,23 @@ measurements, or by Newton's law (docs/model.md, section 1)."""
 
 from __future__ import annotations
 
-import csv
 import math
 from abc import abstractmethod
 from bisect import bisect_left
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
-from pathlib import Path as FilePath
-from typing import Annotated, Any, ClassVar, Literal, Self, TextIO
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 from pydantic import ConfigDict, Field, SerializeAsAny, ValidationInfo, model_validator
 
 from pbdkit.array_types import Floats
-from pbdkit.errors import did_you_mean
-from pbdkit.model.reading import file_resolver
-from pbdkit.model.validation import brief, closed_part, fault
+from pbdkit.model.csv_columns import MAX_ROWS
+from pbdkit.model.validation import brief, closed_part, fault, read_columns
 from pbdkit.plugin import Component
 from pbdkit.plugin.schedule import Force, at
 from pbdkit.plugin.units import Place
-
-MAX_BYTES = 2**26
-"""Maximum size of a table in bytes."""
-MAX_ROWS = 200_000
-"""Maximum number of rows of a table."""
-MAX_LINE = 2**16
-"""Maximum number of characters in a line."""
 
 
 def names_or_file(*names: str) -> Callable[[dict[str, Any]], None]:
@@ -71,92 +61,6 @@ def in_place_of(
         raise fault(f"give either a file, or {' and '.join(names)}", key="file")
     rest = {key: value for key, value in parameters.items() if key != "file"}
     return rest, read_columns(parameters["file"], info, columns)
-
-
-def read_columns(file: Any, info: ValidationInfo, names: Sequence[str]) -> list[list[float]]:
-    """Return the rows of a CSV file, with numbers in the order of `names`.
-
-    The path is relative to the experiment file.
-
-    Raises
-    ------
-    PydanticCustomError
-        If the file cannot be read. The error refers to the key `file` and contains the place and
-        the remedy.
-    """
-    try:
-        path = file_resolver(info).path(file, "CSV")
-        if path.stat().st_size > MAX_BYTES:
-            raise fault(f"{path}: is larger than 64 MiB; remove points", key="file")
-        return list(_rows(path, names))
-    except UnicodeDecodeError as error:
-        raise fault(f"{file}: is not UTF-8: {error.reason}; save it as UTF-8", key="file") from None
-    except (OSError, csv.Error) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise fault(f"{file}: cannot be read: {reason}", key="file") from None
-    except ValueError as error:
-        raise fault(str(error), key="file") from None
-
-
-def _rows(path: FilePath, names: Sequence[str]) -> Iterator[list[float]]:
-    with path.open(encoding="utf-8-sig", newline="") as file:
-        lines = csv.reader(_bounded(file, path), skipinitialspace=True)
-        columns = _columns([name.strip() for name in next(lines, [])], names, path)
-        count = 0
-        for row in lines:
-            if not row:
-                continue
-            count += 1
-            if count > MAX_ROWS:
-                raise fault(f"{path}: has more than {MAX_ROWS} rows; remove some", key="file")
-            place = f"{path}:{lines.line_num}"
-            yield [_number(row[n : n + 1], name, place) for name, n in columns.items()]
-        if not count:
-            raise fault(f"{path}: has no row of numbers below its first line", key="file")
-
-
-def _bounded(file: TextIO, path: FilePath) -> Iterator[str]:
-    """Yield the lines of a table, up to the maximum length of a line."""
-    while line := file.readline(MAX_LINE + 1):
-        if len(line) > MAX_LINE:
-            text = f"{path}: has a line of more than {MAX_LINE} characters"
-            raise fault(f"{text}; remove the columns that are not required", key="file")
-        yield line
-
-
-def _columns(header: list[str], names: Sequence[str], path: FilePath) -> dict[str, int]:
-    """Return the index of each column, which must occur once."""
-    for name in names:
-        if header.count(name) != 1:
-            problem = f"two '{name}'" if name in header else f"no '{name}'"
-            text = f"requires the columns {', '.join(names)}, named in its first line, which has"
-            hint = _separators(header) or did_you_mean(name, {*header} - {*names})
-            raise fault(f"{path}:1: {text} {problem}{hint}", key="file")
-    return {name: header.index(name) for name in names}
-
-
-def _separators(header: list[str]) -> str:
-    """Return a hint if columns are not separated by commas."""
-    for separator, name in ((";", "';'"), ("\t", "tabs")):
-        if any(separator in column for column in header):
-            return (
-                f"; the columns of this file are separated by {name}; save it with commas between "
-                "columns, and points in numbers"
-            )
-    return ""
-
-
-def _number(cell: list[str], name: str, place: str) -> float:
-    """Return the number in a cell of the table. A cell that is missing is empty."""
-    text = "".join(cell)
-    try:
-        number = math.nan if "_" in text else float(text)  # Python would read 1_0 as 10.
-    except ValueError:
-        number = math.nan
-    if not math.isfinite(number):
-        got = repr(text)[:40] if text else "nothing"
-        raise fault(f"{place}: column '{name}' requires a finite number, got {got}", key="file")
-    return number
 
 
 Steps = Annotated[int, Field(ge=1, le=2**62)]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import lru_cache, reduce
 from operator import or_
@@ -27,12 +27,14 @@ from pbdkit.errors import (
     did_you_mean,
     one_line,
 )
+from pbdkit.model.csv_columns import columns_of
 from pbdkit.model.reading import FileResolver, Source, file_resolver
 from pbdkit.plugin import INTERFACES, Component
 from pbdkit.plugin.discovery import component_error
 from pbdkit.plugin.fields import MAX_VALUES, Gridded, TakesFields
 from pbdkit.plugin.registry import Registry
 from pbdkit.plugin.schedule import FORMS, WORD
+from pbdkit.plugin.table import tables_of
 from pbdkit.plugin.units import TEXT
 from pbdkit.untrusted_files import VALUES, read_apart
 
@@ -40,6 +42,25 @@ MAX_BYTES = 2**30
 """Maximum size of a file of spatially varying parameters in bytes."""
 MAX_NAME = 200
 """Maximum number of characters in the name of a variable."""
+
+
+def read_columns(file: Any, info: ValidationInfo, names: Sequence[str]) -> list[list[float]]:
+    """Return the rows of a CSV file, with numbers in the order of `names`.
+
+    The path is relative to the experiment file.
+
+    Raises
+    ------
+    PydanticCustomError
+        If the file cannot be read. The error refers to the key `file` and contains the place and
+        the remedy.
+    """
+    try:
+        return columns_of(file_resolver(info).path(file, "CSV"), names)
+    except OSError as error:
+        raise fault(f"{file}: cannot be read: {error.strerror or error}", key="file") from None
+    except ValueError as error:
+        raise fault(str(error), key="file") from None
 
 
 class FieldFileError(ValueError):
@@ -256,6 +277,8 @@ def _build(value: Any, base: type[Component], find: Finder, info: ValidationInfo
     parameters = {k: v for k, v in value.items() if k != "type"}
     if issubclass(part, TakesFields):
         parameters |= _from_files(parameters, part, info)
+    for key in tables_of(part) & parameters.keys():
+        parameters[key] = _table(parameters[key], key, info)
     try:
         return part.model_validate(parameters, context=info.context)
     except (ValidationError, PbdkitError, MemoryError):
@@ -279,6 +302,33 @@ def _from_files(
             except ValueError as error:
                 raise fault(str(error), key=name) from None
     return result
+
+
+TABLE = "a table from a file requires {file: NAME.csv, columns: [x, y]}, also units: [mm, MPa]; got"
+
+
+def _table(value: Any, key: str, info: ValidationInfo) -> Any:
+    """Read the points of a table from its file, if it has one."""
+    if not isinstance(value, dict) or "file" not in value:
+        return value
+    columns, units = value.get("columns", ["x", "y"]), value.get("units")
+    pairs = (columns, units) if units is not None else (columns,)
+    texts = [isinstance(of, list) and len(of) == 2 and {*map(type, of)} <= {str} for of in pairs]
+    if value.keys() - {"file", "columns", "units"} or not all(texts):
+        raise fault(f"{TABLE} {brief(value)}", key=key)
+    try:
+        points = columns_of(file_resolver(info).path(value["file"], "CSV"), columns)
+    except OSError as error:
+        text = f"{value['file']}: cannot be read: {error.strerror or error}"
+        raise fault(text, key=key) from None
+    except ValueError as error:
+        raise fault(str(error), key=key) from None
+    if units is None:
+        return points
+    return [
+        [x if unit == "1" else f"{x!r} {unit}" for x, unit in zip(point, units, strict=True)]
+        for point in points
+    ]
 
 
 def _component_error(

@@ -82,7 +82,9 @@ from pbdkit.plugin.rule import (
     TearsCells,
     Torn,
     TurnsParticles,
+    UsesAngles,
 )
+from pbdkit.plugin.table import Axes, Table, interpolate
 from pbdkit.plugin.units import AREA, ENERGY, FORCE, FRACTURE_ENERGY, LENGTH, STRESS, Quantity
 from pbdkit.plugin.vector import (
     Condition,
@@ -118,14 +120,15 @@ BUILTIN = GROUP
 
 __all__ = [
     "AREA", "ENERGY", "FORCE", "FRACTURE_ENERGY", "LENGTH", "STRESS", "Anchors", "AppliesTwice",
-    "BasisSite", "BondHistory", "Bonds", "BreaksAtStrain", "Calibrated", "Cell", "CellPolygon",
-    "CellStress", "CellValues", "Command", "Component", "Condition", "Constants", "Diagnostic",
-    "Drawn", "Draws", "FollowerRule", "ForceValues", "FractureModel", "FrameMap", "FramePolicy",
-    "FrameSites", "Here", "Lattice", "LeaderRows", "LoadRows", "Loadable", "MixesCells", "Moment",
-    "Nearness", "NeighbourMetric", "Number", "Numbers", "Offset", "Pair", "Parameters",
-    "ParticleOperation", "Particles", "Quantity", "Remembered", "Remembers", "RenewsBonds",
-    "RenewsParticles", "Segment", "Setting", "SharesParticles", "Slot", "Softens", "SoftensCells",
-    "SpaceVector", "StartsCracked", "Stiffness", "StoresEnergy", "TearsCells", "Tiling", "Torn",
-    "TouchingRows", "TurnsParticles", "UsesStiffness", "Variable", "Vector", "Weights", "dot",
-    "hookimpl", "length", "squared_length", "where",
+    "Axes", "BasisSite", "BondHistory", "Bonds", "BreaksAtStrain", "Calibrated", "Cell",
+    "CellPolygon", "CellStress", "CellValues", "Command", "Component", "Condition", "Constants",
+    "Diagnostic", "Drawn", "Draws", "FollowerRule", "ForceValues", "FractureModel", "FrameMap",
+    "FramePolicy", "FrameSites", "Here", "Lattice", "LeaderRows", "LoadRows", "Loadable",
+    "MixesCells", "Moment", "Nearness", "NeighbourMetric", "Number", "Numbers", "Offset", "Pair",
+    "Parameters", "ParticleOperation", "Particles", "Quantity", "Remembered", "Remembers",
+    "RenewsBonds", "RenewsParticles", "Segment", "Setting", "SharesParticles", "Slot", "Softens",
+    "SoftensCells", "SpaceVector", "StartsCracked", "Stiffness", "StoresEnergy", "Table",
+    "TearsCells", "Tiling", "Torn", "TouchingRows", "TurnsParticles", "UsesAngles", "UsesStiffness",
+    "Variable", "Vector", "Weights", "dot", "hookimpl", "interpolate", "length", "squared_length",
+    "where",
 ]  # fmt: skip

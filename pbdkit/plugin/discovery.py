@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import inspect
 import re
+import types
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -23,7 +24,7 @@ from pydantic import ValidationError
 
 from pbdkit.errors import ExperimentError, PbdkitError, PluginError, one_line
 from pbdkit.hooks import GROUP, Offer, Plugin, guarded, hook_answer, worded
-from pbdkit.plugin import INTERFACES, Component, SharesParticles
+from pbdkit.plugin import BUILTIN, INTERFACES, Component
 
 
 def interface_of(component: type[Component]) -> type[Component]:
@@ -162,15 +163,21 @@ def checked(component: Any) -> Offer:
     return offer_of(component)
 
 
+FUNCTIONS = (types.FunctionType, staticmethod, classmethod)
+"""Types of methods in the namespace of a class."""
+
+
 def _check_functions(component: type[Component]) -> None:
     """Check that methods have the signature of the interface, and are static where declared so."""
-    interface, label = interface_of(component), component.__name__
-    for name, declared in list(vars(interface).items()):
-        if name.startswith("_") or not callable(getattr(interface, name)):
-            continue
+    label, declarations = component.__name__, dict[str, tuple[type, Any]]()
+    for base in reversed(component.__mro__):
+        if base.__module__.startswith(f"{BUILTIN}.plugin.") and not issubclass(Component, base):
+            declarations |= {name: (base, declared) for name, declared in vars(base).items()}
+    for name, (base, declared) in declarations.items():
         function = inspect.getattr_static(component, name)
-        is_shared = issubclass(component, SharesParticles) and name in vars(SharesParticles)
-        specification = getattr(SharesParticles if is_shared else interface, name)
+        if name.startswith("_") or not isinstance(declared, FUNCTIONS) or function is declared:
+            continue
+        specification = getattr(base, name)
         parameters = list(inspect.signature(specification).parameters)
         call = f"{name}({', '.join(parameters)})"
         if isinstance(declared, staticmethod) and not isinstance(function, staticmethod):

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple, cast
+from typing import Any, ClassVar, Literal, NamedTuple, cast, get_origin
 
 import numpy as np
 
 from pbdkit.array_types import Floats
+from pbdkit.errors import ExperimentError
 from pbdkit.plugin.component import Remembers
 from pbdkit.plugin.fields import TakesFields
 from pbdkit.plugin.lattice import Cell, Slot, Tiling
+from pbdkit.plugin.table import tables_of
 from pbdkit.plugin.vector import Number, Numbers, Parameters, Vector, Weights
 
 
@@ -127,7 +130,7 @@ class FollowerRule(TakesFields):
 
     Optional capabilities are further base classes: `Calibrated`, `Loadable`, `TearsCells`,
     `MixesCells`, `StoresEnergy`, `Remembers`, `Draws`, `RenewsParticles`, `SharesParticles`,
-    `TurnsParticles`, `AppliesTwice`.
+    `TurnsParticles`, `AppliesTwice`, `UsesAngles`.
     """
 
     _elsewhere: ClassVar[Mapping[str, str]] = {
@@ -152,10 +155,11 @@ class FollowerRule(TakesFields):
     belong to this cell.
     """
 
-    def parameters(self, setting: Setting) -> dict[str, float]:
-        """Return the numbers that `gather` and `apply` receive as ``p.name``.
+    def parameters(self, setting: Setting) -> dict[str, Any]:
+        """Return the parameters that `gather` and `apply` receive as ``p.name``.
 
-        By default these are the numeric fields.
+        By default these are the numeric fields, the tables, and the fields that are chosen by name
+        (``mode: Literal["a", "b"]``). A word can be compared by ``==`` and ``!=``.
 
         Parameters
         ----------
@@ -164,15 +168,23 @@ class FollowerRule(TakesFields):
 
         Returns
         -------
-        dict of str to float
-            Numbers by name.
+        dict of str to float, str or Table
+            Parameters by name.
 
         Raises
         ------
         ExperimentError
             If the rule cannot be combined with the lattice.
         """
-        return self.numeric_parameters()
+        fields = type(self).model_fields.items()
+        words = {
+            name: getattr(self, name)
+            for name, field in fields
+            if get_origin(field.annotation) is Literal and isinstance(field.default, str)
+        }
+        del words["type"]
+        tables = {name: getattr(self, name) for name in tables_of(type(self))}
+        return self.numeric_parameters() | words | tables
 
     def weights(self, slot: Slot, setting: Setting) -> dict[str, float]:
         """Return the constants of a slot, which `gather` receives as ``w.name``.
@@ -558,6 +570,73 @@ class AppliesTwice(ABC):
         -------
         FollowerRule
             Rule that computes the moves which `gather` and `apply` receive.
+        """
+
+
+class UsesAngles(ABC):
+    """A rule that sums over pairs of neighbours in addition to the neighbours.
+
+    A pair of neighbours k and l forms an angle at the particle j. Its sides are
+    x_k - x_j = r1 + d1 and x_l - x_j = r2 + d2. The sums over the pairs are appended to the sums
+    that `apply` receives. At a broken bond the fictitious point is a neighbour. A pair of which one
+    neighbour does not exist makes no contribution.
+    """
+
+    def pairs(self, slots: tuple[Slot, ...]) -> tuple[tuple[int, int], ...]:
+        """Return the pairs of slots of a sublattice.
+
+        By default these are, for each shell, the slots that are consecutive counterclockwise.
+
+        Parameters
+        ----------
+        slots : tuple of Slot
+            Slots of the sublattice.
+
+        Returns
+        -------
+        tuple of (int, int)
+            Indices of the two slots of each pair, in the order of the summation.
+
+        Raises
+        ------
+        ExperimentError
+            In space, where slots are not ordered by an angle.
+        """
+        if len(slots[0].rest) != 2:
+            raise ExperimentError(
+                "has pairs of neighbours in the plane only; define `pairs(slots)` for lattices in "
+                "space"
+            )
+        pairs: list[tuple[int, int]] = []
+        for shell in {slot.shell for slot in slots}:
+            numbers = [n for n, slot in enumerate(slots) if slot.shell == shell]
+            numbers.sort(key=lambda n: math.atan2(slots[n].rest.y, slots[n].rest.x))
+            following = [*numbers[1:], *numbers[:1]] if len(numbers) > 1 else []
+            pairs += zip(numbers, following, strict=False)
+        return tuple(sorted(pairs))
+
+    @staticmethod
+    @abstractmethod
+    def gather_pair(
+        d1: Vector, d2: Vector, r1: Vector, r2: Vector, w1: Weights, w2: Weights, p: Parameters
+    ) -> tuple[Vector | Number, ...]:
+        """Return the contributions of a pair of neighbours k and l, elementwise.
+
+        Parameters
+        ----------
+        d1, d2 : Vector
+            Differences u_k - u_j and u_l - u_j, in lattice units.
+        r1, r2 : Vector
+            Rest offsets X_k - X_j and X_l - X_j, in lattice units.
+        w1, w2 : Weights
+            Constants of the two slots.
+        p : Parameters
+            Parameters of the rule.
+
+        Returns
+        -------
+        tuple of Vector or Number
+            Contributions, which pbdkit sums over the pairs.
         """
 
 

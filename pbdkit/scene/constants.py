@@ -13,7 +13,7 @@ from collections.abc import Callable, Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from functools import cache, partial
-from itertools import combinations
+from itertools import chain, combinations
 from operator import add
 from typing import Any
 
@@ -37,13 +37,16 @@ from pbdkit.plugin import (
     Draws,
     FollowerRule,
     FractureModel,
+    MixesCells,
     Remembered,
     Remembers,
     Setting,
     Slot,
     Softens,
     SoftensCells,
+    StoresEnergy,
     TearsCells,
+    UsesAngles,
     UsesStiffness,
     Vector,
 )
@@ -51,6 +54,7 @@ from pbdkit.plugin.component import as_values
 from pbdkit.plugin.discovery import errors_attributed_to
 from pbdkit.plugin.fields import ByRegion, TakesFields
 from pbdkit.plugin.rule import material_of
+from pbdkit.plugin.table import Table
 from pbdkit.plugin.vector import vector
 
 Declared = tuple[Remembered, ...]
@@ -272,6 +276,10 @@ Planes = Mapping[str, Floats]
 """Type of values for each particle or each bond, by name."""
 
 
+Pairs = tuple[tuple[int, int], ...]
+"""Type of pairs of slots, by their indices."""
+
+
 @dataclass(frozen=True)
 class SceneConstants:
     """Constants passed to elementwise functions, as named tuples.
@@ -293,6 +301,8 @@ class SceneConstants:
         Named tuple of state variables of a particle, ``here.own``.
     by_particle
         Spatially varying parameters of the rule by name, (sublattice, cell, cell).
+    pairs
+        Pairs of slots of each sublattice, for a rule that uses angles.
     by_bond
         Spatially varying limits by name, (plane, cell, cell).
     """
@@ -303,6 +313,7 @@ class SceneConstants:
     limits: dict[Slot, Any]
     of_bond: Any
     of_particle: Any
+    pairs: tuple[Pairs, ...] = ()
     by_particle: Planes = field(default_factory=dict)
     by_bond: Planes = field(default_factory=dict)
 
@@ -315,7 +326,18 @@ class SceneConstants:
     @property
     def shared(self) -> list[float]:
         """Parameters of the rule that do not vary in space."""
-        return [v for name, v in self.rule._asdict().items() if name not in self.by_particle]
+        numbers = {name: v for name, v in self.rule._asdict().items() if isinstance(v, float)}
+        return [v for name, v in numbers.items() if name not in self.by_particle]
+
+    @property
+    def choices(self) -> list[str]:
+        """Parameters of the rule that are chosen by name."""
+        return [v for v in self.rule if isinstance(v, str)]
+
+    @property
+    def tables(self) -> list[Floats]:
+        """Parameters of the rule that are tables."""
+        return [v for v in self.rule if isinstance(v, np.ndarray)]
 
     def limits_of(self, slot: Slot) -> list[float]:
         """Return those limits of a slot that do not vary in space."""
@@ -346,9 +368,10 @@ def scene_constants(experiment: Experiment, setting: Setting) -> SceneConstants:
     slots = [slot for ends in setting.slots for slot in ends]
     rule, fracture = experiment.rule, experiment.fracture
     with errors_attributed_to(rule, "to return its constants", "rule"):
-        of_rule = _named("Parameters", rule.parameters(setting))
+        of_rule = _named("Parameters", rule.parameters(setting), _parameter)
         weights = {s: named_weights(rule.weights(s, setting), rule) for s in slots}
         _refuse_other_names(weights, "weights")
+        pairs = _pairs(rule, setting, experiment)
     with errors_attributed_to(fracture, "to return its constants", "fracture"):
         of_fracture = _named("Parameters", fracture.parameters())
         material_constants = {s: of_material(fracture, rule, setting, s) for s in slots}
@@ -372,7 +395,51 @@ def scene_constants(experiment: Experiment, setting: Setting) -> SceneConstants:
             )
     particle_names = tuple(number.name for number in particle_numbers(experiment))
     kinds = _kind("Constants", names), _kind("Own", particle_names)
-    return SceneConstants(of_rule, weights, of_fracture, limits, *kinds)
+    return SceneConstants(of_rule, weights, of_fracture, limits, *kinds, pairs)
+
+
+NO_PAIRS = (TearsCells, MixesCells, StoresEnergy)
+"""Capabilities of which the functions receive single neighbours, so that they cannot be combined
+with sums over pairs."""
+
+
+def _pairs(rule: FollowerRule, setting: Setting, experiment: Experiment) -> tuple[Pairs, ...]:
+    """Return the pairs of slots of each sublattice; none if the rule does not use angles.
+
+    Raises
+    ------
+    ExperimentError
+        If a sublattice has no pairs, or neighbours are re-evaluated.
+    PluginError
+        If the rule has capabilities that cannot be combined, or returns malformed pairs.
+    """
+    if not isinstance(rule, UsesAngles):
+        return ()
+    for kind in NO_PAIRS:
+        if isinstance(rule, kind):
+            raise PluginError(
+                f"'{rule.type}' is both {kind.__name__} and UsesAngles, which cannot be combined; "
+                "remove one of the two base classes"
+            )
+    if experiment.neighbours.nearness():
+        raise ExperimentError(
+            f"'{rule.type}' sums over pairs of constant neighbours; set neighbours.reevaluate: "
+            "false"
+        )
+    result = []
+    for slots in setting.slots:
+        pairs = tuple((int(k), int(n)) for k, n in as_values(rule.pairs(slots), "pairs"))
+        if not pairs:
+            raise ExperimentError(
+                f"'{rule.type}' requires pairs of neighbours; this lattice has none in a shell: "
+                "use neighbours with two or more in a shell"
+            )
+        if any(not 0 <= n < len(slots) for n in chain.from_iterable(pairs)):
+            raise ValueError(
+                f"`pairs` returned {pairs}; return indices of the slots, from 0 to {len(slots) - 1}"
+            )
+        result.append(pairs)
+    return tuple(result)
 
 
 def _refuse_pulling(
@@ -421,15 +488,24 @@ def of_material(
     return fracture.of_material(slot, rule, setting)
 
 
-def _named(kind: str, values: Any, **constants: float) -> Any:
+def _parameter(value: Any) -> Any:
+    """Return a parameter of a rule as its functions receive it: a number, a word or a table."""
+    if isinstance(value, str):
+        return value
+    return value.array if isinstance(value, Table) else float(value)
+
+
+def _named(
+    kind: str, values: Any, convert: Callable[[Any], Any] = float, **constants: float
+) -> Any:
     """Return a named tuple of Python floats. numpy's scalars are not used because they would
-    promote single precision to double precision."""
+    promote single precision to double precision. Another function can convert the values."""
     if not isinstance(values, dict):
         raise TypeError(
             f"it returned {type(values).__name__}; return numbers by name: {{'k': 1.0}}"
         )
     names = (*values, *constants)
-    return _kind(kind, names)(*map(float, (*values.values(), *constants.values())))
+    return _kind(kind, names)(*map(convert, (*values.values(), *constants.values())))
 
 
 @cache
@@ -460,6 +536,10 @@ class Owner(Enum):
     """One value for each bond, constant in time."""
     FIXED_PARTICLE = "particle, by a field"
     """One value for each particle, constant in time."""
+    CHOICE = "scene, as a word"
+    """One word for the whole scene, which is a constant of the code."""
+    TABLE = "scene, as a table"
+    """One table for the whole scene."""
 
 
 @dataclass(frozen=True)
@@ -518,13 +598,23 @@ def numbers_of(
     weights = next(iter(constants.weights.values()))._fields
     limits = next(iter(constants.limits.values()))._fields
     return VisibleNumbers(
-        _all(constants.rule._fields, Owner.SCENE, constants.by_particle, Owner.FIXED_PARTICLE),
+        tuple(Number(name, _owner(name, constants)) for name in constants.rule._fields),
         tuple(Number(w, Owner.CELL if w in shares else Owner.SLOT) for w in weights),
         _remembered(particle_numbers(experiment), Owner.PARTICLE),
         _all(constants.fracture._fields, Owner.SCENE),
         _all(limits, Owner.SLOT, constants.by_bond, Owner.FIXED_BOND)
         + _remembered(bond_numbers(experiment), Owner.BOND),
     )
+
+
+def _owner(name: str, constants: SceneConstants) -> Owner:
+    """Return the owner of a parameter of the rule."""
+    value = getattr(constants.rule, name)
+    if isinstance(value, str):
+        return Owner.CHOICE
+    if isinstance(value, np.ndarray):
+        return Owner.TABLE
+    return Owner.FIXED_PARTICLE if name in constants.by_particle else Owner.SCENE
 
 
 def _all(
@@ -620,7 +710,12 @@ def _by_particle(
     values = values_at(experiment, "rule", x, y, np.ones(len(rows), bool))
     _refuse_weights(rule, values, setting)
     place, result = raster.place_of(rows), {}
-    for name, numbers in _evaluate(rule, values, lambda part: part.parameters(setting)).items():
+
+    def numbers_of_rule(part: FollowerRule) -> dict[str, Any]:
+        parameters = part.parameters(setting).items()
+        return {name: v for name, v in parameters if not isinstance(v, (str, Table))}
+
+    for name, numbers in _evaluate(rule, values, numbers_of_rule).items():
         base = getattr(constants.rule, name)
         if raster.communicator.any((numbers != base).any()):
             planes = np.full(raster.shape, base)

@@ -29,7 +29,7 @@ from pbdkit.scene.leader_groups import guided_at, has_guides, kinds_at
 from pbdkit.scene.obstacles import SLACK, Outline, Walls, contact_correction, outlines_at
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.kernel import Function, KernelWriter, Lines
-from pbdkit.stepping.rule_evaluation import Evaluator, Surroundings, summed
+from pbdkit.stepping.rule_evaluation import Evaluator, Surroundings
 from pbdkit.stepping.state import State, unmoved_state
 from pbdkit.stepping.step import (
     PUSHED_BY_TIME_DEPENDENCE,
@@ -77,8 +77,8 @@ def _stiffnesses(scene: Scene, place: Indices, sublattice: int) -> Floats:
         answers = []
         for e in np.eye(scene.axes):
             u = vector(np.full(len(place), nudge * c) for c in e)
-            parts = [(evaluator.contribution(-u, u, to), to.present) for to in neighbours]
-            total, at = summed(parts), values._replace(u=u)
+            total = evaluator.total([-u] * len(neighbours), u, neighbours)
+            at = values._replace(u=u)
             both = evaluator.move(total, at), evaluator.force(total, at)
             answers.append([[np.broadcast_to(c, len(place)) for c in columns] for columns in both])
         move, force = np.array(answers).transpose(1, 3, 2, 0)

@@ -158,7 +158,7 @@ class SlotFollowers(Followers):
                 state, particle_values=tuple(v.copy() for v in state.particle_values)
             )
         for around, evaluator in zip(self._blocks, self._evaluators, strict=True):
-            total = around.sums(evaluator.contribution, planes, previous)
+            total = around.total(evaluator, planes, previous)
             yield around, evaluator, total, around.here(planes, state)
 
 
@@ -328,6 +328,12 @@ class MoveFollowers(Operation):
                 Mode.TIME_DEPENDENT_SOLVER: changing,
             }
             return Hindrance(reasons.get(mode, "neighbours are re-evaluated"), "neighbours")
+        if mode is Mode.GPU and any(each.constants.pairs for each in _levels(self.scene)):
+            return Hindrance("the rule sums over pairs of neighbours", "rule")
+        if mode is Mode.GPU and any(
+            each.constants.choices or each.constants.tables for each in _levels(self.scene)
+        ):
+            return Hindrance("parameters of the rule are tables or chosen by name", "rule")
         if mode is Mode.PASSES and self.sweeps() > 2:
             return Hindrance("the rule applies another rule more than twice", "rule")
         if mode is Mode.RANKS_AT_REST and (self.scene.inner or not self._rule.linear):

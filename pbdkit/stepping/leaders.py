@@ -219,7 +219,7 @@ class NewtonForces:
             return np.asarray(forces.reshape(len(forces), -1)[:, place].T, float)
         forces = np.zeros((len(place), self._scene.axes))
         for rows, around in self._parts[n]:
-            total = around.sums(self._evaluator.contribution, state.u, state)
+            total = around.total(self._evaluator, state.u, state)
             force = self._evaluator.force(total, around.here(state.u, state))
             movable = True if around.movable is None else around.movable
             for axis, component in enumerate(force):

@@ -7,7 +7,7 @@ same functions; tests compare the results of kernels with those of this module.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property, reduce
@@ -32,6 +32,7 @@ from pbdkit.plugin import (
     SoftensCells,
     StoresEnergy,
     Torn,
+    UsesAngles,
     Vector,
     where,
 )
@@ -57,7 +58,8 @@ class Neighbour:
     weights of cells that have a stiffness other than that of the rule; their contributions are
     added. `shared` are the state variables of the particle and of the neighbour, for rules that
     read both. `torn` is the damage beside the bond, for rules that compute the forces of torn
-    cells; such rules receive the unchanged difference of the displacements.
+    cells; such rules receive the unchanged difference of the displacements. `sublattice` is that of
+    the particles.
     """
 
     r: Vector
@@ -68,6 +70,7 @@ class Neighbour:
     more: tuple[Any, ...] = ()
     shared: tuple[Any, ...] = ()
     torn: Torn | None = None
+    sublattice: int = 0
 
 
 class Evaluator:
@@ -104,6 +107,28 @@ class Evaluator:
         if to.torn is not None:
             return rule.torn(d, to.r, w, to.torn, self._p)
         return rule.gather(d, to.r, w, self._p, *to.shared)
+
+    def total(
+        self, d: Sequence[Vector], u: Vector, neighbours: Sequence[Neighbour]
+    ) -> Contributions:
+        """Return the sums of the contributions of all neighbours and, if the rule uses angles, of
+        all pairs of neighbours."""
+        along = list(zip(d, neighbours, strict=True))
+        total = summed((self.contribution(one, u, to), to.present) for one, to in along)
+        return total + summed(self.pair_contributions(d, u, neighbours))
+
+    def pair_contributions(
+        self, d: Sequence[Vector], u: Vector, neighbours: Sequence[Neighbour]
+    ) -> Iterator[tuple[Contributions, Mask | None]]:
+        """Generate the contribution of each pair of neighbours, with a mask that is true where both
+        neighbours exist. The neighbours are those along all slots of a sublattice."""
+        if not isinstance(self.rule, UsesAngles):
+            return
+        seen = [self.seen(one, u, to) for one, to in zip(d, neighbours, strict=True)]
+        for k, n in self._scene.constants.pairs[neighbours[0].sublattice]:
+            one, other = neighbours[k], neighbours[n]
+            part = self.rule.gather_pair(seen[k], seen[n], one.r, other.r, one.w, other.w, self._p)
+            yield as_values(part, "gather_pair"), _both(one.present, other.present)
 
     def energy(self, d: Vector, u: Vector, to: Neighbour) -> Contributions:
         """Return half the energy of a bond, the part that belongs to one end."""
@@ -206,14 +231,17 @@ class Evaluator:
         state variables have their initial values."""
         weights = self._scene.constants.weights
         shared = (self.initial_own(),) * 2 if shares_particles(self.rule) else ()
-        return [Neighbour(slot.rest, weights[slot], shared=shared) for slot in slots]
+        return [
+            Neighbour(slot.rest, weights[slot], shared=shared, sublattice=slot.source)
+            for slot in slots
+        ]
 
     def at_rest(self, slots: Sequence[Slot]) -> Any:
         """Return the move, at rest, of a particle that has a neighbour along each of the slots and
         no broken bond."""
         u = vector(np.zeros(self._scene.axes))
-        parts = [self.contribution(u, u, to) for to in self.everywhere(slots)]
-        return self.move(summed((part, None) for part in parts), Here(u, own=self.initial_own()))
+        total = self.total([u] * len(slots), u, self.everywhere(slots))
+        return self.move(total, Here(u, own=self.initial_own()))
 
     def initial_own(self) -> Any:
         """Return the initial state variables of a particle. They must not be drawn at random."""
@@ -232,6 +260,13 @@ def summed(parts: Iterable[tuple[Contributions, Mask | None]]) -> Contributions:
             part = tuple(_masked(value, present) for value in part)
         total = part if total is None else tuple(a + b for a, b in zip(total, part, strict=True))
     return total or ()
+
+
+def _both(one: Mask | None, other: Mask | None) -> Mask | None:
+    """Return a mask that is true where two masks are; None is true everywhere."""
+    if one is None or other is None:
+        return other if one is None else one
+    return one & other
 
 
 def _masked(value: Any, present: Mask) -> Any:
@@ -272,7 +307,11 @@ class Surroundings:
         """Neighbours in a scene without fracture in which the rule reads no state variables of
         neighbours."""
         parts = zip(self.slots, self._weights, self._present, self._more, strict=True)
-        return [Neighbour(slot.rest, w, present, more=extra) for slot, w, present, extra in parts]
+        s = self._sublattice
+        return [
+            Neighbour(slot.rest, w, present, more=extra, sublattice=s)
+            for slot, w, present, extra in parts
+        ]
 
     @cached_property
     def _reference(self) -> tuple[Any, Any]:
@@ -301,7 +340,13 @@ class Surroundings:
             ]
         return [
             Neighbour(
-                slot.rest, w, present, *self._bond(slot, state), extra, self._shared(slot, state)
+                slot.rest,
+                w,
+                present,
+                *self._bond(slot, state),
+                extra,
+                self._shared(slot, state),
+                sublattice=self._sublattice,
             )
             for slot, w, present, extra in parts
         ]
@@ -323,10 +368,15 @@ class Surroundings:
 
     def sums(self, function: Contributing, u: NDArray[Any], state: State) -> Contributions:
         """Return the sum of function(d, u, neighbour) over the neighbours. The function has the
-        signature of `Evaluator.contribution`."""
+        signature of `Evaluator.energy`."""
         u_own = vector(shown(self.where.of(u)))
         parts = zip(self.differences(u), self.neighbours(state), strict=True)
         return summed((function(d, u_own, to), to.present) for d, to in parts)
+
+    def total(self, evaluator: Evaluator, u: NDArray[Any], state: State) -> Contributions:
+        """Return the sums of the contributions that `apply` receives."""
+        u_own = vector(shown(self.where.of(u)))
+        return evaluator.total(self.differences(u), u_own, self.neighbours(state))
 
     def _weigh_cells(self, cells: WeighedCells) -> None:
         """Multiply the weights of each slot by the area fractions of the cells beside it. Add the

@@ -64,8 +64,10 @@ from pbdkit.testing.states import (
     moment_of,
     numbers_of,
     owners,
+    paired,
     remembers,
     stressed,
+    totals,
 )
 from pbdkit.testing.subject import (
     Arrays,
@@ -533,7 +535,8 @@ It is needed because the last digit of a numpy function may depend on the positi
 @property_of(FollowerRule, FractureModel, ParticleOperation, is_needed=True)
 def returns_a_value_a_particle(subject: Subject) -> None:
     """Results have one value for each particle, or one number for all; a rule returns the same
-    number of contributions for every neighbour, and `breaks` returns booleans."""
+    number of contributions for every neighbour and for every pair, and `breaks` returns
+    booleans."""
     for call in _elementwise(subject):
         for name, value in call.answer().items():
             if value.shape not in ((), SHAPE):
@@ -543,9 +546,11 @@ def returns_a_value_a_particle(subject: Subject) -> None:
                 raise PropertyError(f"`{call.function}` {fault}; it is not elementwise")
     if isinstance(subject.component, FollowerRule):
         scene = subject.scene
-        counts = {len(c) for c in gathered(scene, differences(scene, 0))}
-        if len(counts) > 1:
-            raise PropertyError(f"`gather` returns between {min(counts)} and {max(counts)} values")
+        for name, function in (("gather", gathered), ("gather_pair", paired)):
+            counts = {len(c) for c in function(scene, differences(scene, 0))}
+            if len(counts) > 1:
+                few, many = min(counts), max(counts)
+                raise PropertyError(f"`{name}` returns between {few} and {many} values")
 
 
 @property_of()
@@ -646,9 +651,8 @@ def _refuse_an_order_of_rows(subject: Subject) -> None:
 
 
 def _refuse_an_order_of_slots(scene: Scene) -> None:
-    contributions, at = gathered(scene, differences(scene, 0)), here(scene, 0)
-    orders = contributions, contributions[::-1]
-    forwards, backwards = (flat(applied(scene, order, **at)) for order in orders)
+    d, at = differences(scene, 0), here(scene, 0)
+    forwards, backwards = (flat(applied(scene, totals(scene, d, n), **at)) for n in (1, -1))
     for name, value in forwards.items():
         if _apart(value, backwards[name]) is not None:
             fault = f"the move depends on the order in which neighbours are summed ({name})"

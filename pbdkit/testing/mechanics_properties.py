@@ -17,6 +17,7 @@ from pbdkit.array_types import Floats
 from pbdkit.errors import ExperimentError
 from pbdkit.model.experiment import Experiment
 from pbdkit.plugin import (
+    Axes,
     Component,
     Draws,
     FollowerRule,
@@ -97,6 +98,11 @@ def _scaled(part: Component) -> Component:
     parameters: dict[str, Any] = part.model_dump(by_alias=True)
     for key, power in _lengths(part).items():
         parameters[key] = _times(LARGER**power, parameters[key])
+    for name, field in type(part).model_fields.items():
+        for axes in (each for each in field.metadata if isinstance(each, Axes)):
+            x, y = (LARGER ** (each.length if each else 0) for each in (axes.x, axes.y))
+            table = parameters[field.alias or name]
+            parameters[field.alias or name] = [(x * point[0], y * point[1]) for point in table]
     return type(part).model_validate(parameters)
 
 

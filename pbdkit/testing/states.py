@@ -145,9 +145,26 @@ def gathered(scene: Scene, d: list[Any], shared: Any = ()) -> list[tuple[Any, ..
     return [evaluator.contribution(v, v, to) for v, to in zip(d, neighbours, strict=True)]
 
 
-def applied(scene: Scene, contributions: list[tuple[Any, ...]], **at: Any) -> Any:
+def paired(scene: Scene, d: list[Any]) -> list[tuple[Any, ...]]:
+    """Return the contributions of every pair of slots; none if the rule does not use angles."""
+    evaluator = Evaluator(scene)
+    neighbours = evaluator.everywhere(scene.neighbourhood.slots[0])
+    return [part for part, _ in evaluator.pair_contributions(d, d[0], neighbours)]
+
+
+def totals(scene: Scene, d: list[Any], order: int = 1) -> tuple[Any, ...]:
+    """Return the sums of the contributions that the rule receives. With `order` -1, neighbours and
+    pairs are summed in the reverse order."""
+    one, other = (
+        summed((part, None) for part in parts[::order])
+        for parts in (gathered(scene, d), paired(scene, d))
+    )
+    return one + other
+
+
+def applied(scene: Scene, total: tuple[Any, ...], **at: Any) -> Any:
     """Return the move that the rule computes from the sums of contributions."""
-    return Evaluator(scene).move(summed((c, None) for c in contributions), here_of(scene, **at))
+    return Evaluator(scene).move(total, here_of(scene, **at))
 
 
 def here_of(scene: Scene, u: Any, X: Any, own: Any) -> Here:

@@ -30,7 +30,7 @@ from pbdkit.scene.scene import Scene
 from pbdkit.simulation import Simulation, record
 from pbdkit.stepping.engine_choice import obstacle
 from pbdkit.stepping.numpy_engine import Stepper
-from pbdkit.stepping.rule_evaluation import Evaluator, summed
+from pbdkit.stepping.rule_evaluation import Evaluator
 from pbdkit.stepping.state import State, initial_state
 from pbdkit.testing.component_properties import differing
 from pbdkit.testing.mechanics import resumed
@@ -38,12 +38,12 @@ from pbdkit.testing.states import (
     advanced,
     differences,
     displacements,
-    gathered,
     here,
     here_of,
     measured_by,
     spacing,
     state_with,
+    totals,
 )
 from pbdkit.testing.subject import (
     NotApplicableError,
@@ -70,7 +70,7 @@ def bears_loads_as_forces(subject: Subject) -> None:
     evaluator, p = Evaluator(scene), scene.constants.rule
     load, added = here(scene, 1)["u"], []
     for seed in (0, 1):
-        total = summed((c, None) for c in gathered(scene, differences(scene, seed)))
+        total = totals(scene, differences(scene, seed))
         at, under = here_of(scene, **here(scene, seed)), rule.loaded(total, load, p)
         _compare(
             evaluator.force(under, at),

@@ -40,6 +40,7 @@ from pbdkit.plugin import (
     RenewsParticles,
     Softens,
     SoftensCells,
+    UsesAngles,
     UsesStiffness,
     Vector,
 )
@@ -50,7 +51,7 @@ from pbdkit.plugin.units import is_needed
 from pbdkit.scene.frame import sites_of_frame
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.seeds import component_generator
-from pbdkit.stepping.rule_evaluation import Evaluator, summed
+from pbdkit.stepping.rule_evaluation import Evaluator
 from pbdkit.testing.mechanics import Solid, solids_of
 from pbdkit.testing.states import (
     SEED,
@@ -65,9 +66,11 @@ from pbdkit.testing.states import (
     measured_by,
     moment_of,
     owners,
+    paired,
     remembers,
     shared,
     stressed,
+    totals,
 )
 
 Arrays = dict[str, Any]
@@ -139,15 +142,17 @@ def calls_of(component: Component, scene: Scene, seed: int) -> list[FunctionCall
 @calls_of.register
 def _to_rule(rule: FollowerRule, scene: Scene, seed: int) -> list[FunctionCall]:
     """Return calls of `gather` and `apply`, also with r + d = 0 along every slot, and of
-    `remember`, `force`, `loaded` and `draw` if the rule has them.
+    `gather_pair`, `remember`, `force`, `loaded` and `draw` if the rule has them.
     """
     d, at, evaluator = differences(scene, seed), here(scene, seed), Evaluator(scene)
-    contributions = gathered(scene, each(np.array, d))
     inputs = {"d": d, "shared": shared(scene, at["own"])}
-    gather = FunctionCall("gather", inputs, partial(gathered, scene), elementwise=True)
-    if len({len(flat(parts)) for parts in contributions}) > 1:
-        return [gather]  # They cannot be summed, which another property reports.
-    sums = summed((c, None) for c in contributions)
+    gather = [FunctionCall("gather", inputs, partial(gathered, scene), elementwise=True)]
+    if isinstance(rule, UsesAngles):
+        gather.append(FunctionCall("gather_pair", {"d": d}, partial(paired, scene), True))
+    for function in (gathered, paired):
+        if len({len(flat(parts)) for parts in function(scene, each(np.array, d))}) > 1:
+            return gather  # They cannot be summed, which another property reports.
+    sums = totals(scene, each(np.array, d))
     total = each(lambda t: np.broadcast_to(t, SHAPE).copy(), sums)
     functions: dict[str, Callable[[Any, Here], Any]] = {"apply": evaluator.move}
     if isinstance(rule, RenewsParticles):
@@ -172,10 +177,10 @@ def _to_rule(rule: FollowerRule, scene: Scene, seed: int) -> list[FunctionCall]:
     name = "apply with all neighbours at the position of the particle"
 
     def coincident_move(d: Any, **to: Any) -> Any:
-        return applied(scene, gathered(scene, d), **to)
+        return applied(scene, totals(scene, d), **to)
 
     coincident = FunctionCall(name, meeting | at, coincident_move)
-    return [gather, *map(call, functions), *loads, coincident, *_to_draw(rule, scene)]
+    return [*gather, *map(call, functions), *loads, coincident, *_to_draw(rule, scene)]
 
 
 @calls_of.register

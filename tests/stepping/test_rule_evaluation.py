@@ -63,6 +63,8 @@ class HasTable(Plain):
 
 
 class HasMode(HasTable):
+    """A text is not a mode."""
+
     type: Literal["has-mode"] = "has-mode"
 
     @staticmethod

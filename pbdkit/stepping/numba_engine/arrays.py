@@ -52,6 +52,12 @@ def constant_arrays(plan: Plan) -> Arrays:
             arrays["mixed"] = np.stack(mixed, axis=-1).astype(real)
     for name, planes in (("field", constants.by_particle), ("limit", constants.by_bond)):
         arrays |= {f"{name}{n}": np.array(v, real) for n, v in enumerate(planes.values())}
+    for level in plan.levels:
+        if level.pairs:
+            n, count = level.number, max(map(len, level.pairs))
+            padded_pairs = [[*pairs, *[pairs[0]] * (count - len(pairs))] for pairs in level.pairs]
+            arrays[f"pair_counts{n}"] = np.array([len(pairs) for pairs in level.pairs])
+            arrays[f"pair_slots{n}"] = np.array(padded_pairs, np.int64)
     if scene.tears:
         arrays |= sweeps.tearing_arrays(scene)
     if plan.softens_cells:
@@ -153,7 +159,12 @@ def rule_arrays(plan: Plan) -> Arrays:
     rules = {
         f"rule{n}": [*level.scene.constants.shared, 0.0] for n, level in enumerate(plan.levels)
     }
-    numbers = {"solver": [solver.relaxation, solver.memory], **rules}
+    tables = {
+        f"table{n}_{m}": table
+        for n, level in enumerate(plan.levels)
+        for m, table in enumerate(level.scene.constants.tables)
+    }
+    numbers = {"solver": [solver.relaxation, solver.memory], **rules, **tables}
     return {name: np.array(values, solver.precision) for name, values in numbers.items()}
 
 

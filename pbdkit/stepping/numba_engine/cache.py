@@ -31,14 +31,22 @@ from typing import Any
 
 import numba
 import numpy as np
+from numba.core.imputils import lower_constant
 from numba.core.registry import cpu_target
-from numba.extending import overload, register_jitable
+from numba.extending import (
+    models,
+    overload,
+    register_jitable,
+    register_model,
+    typeof_impl,
+)
 
 from pbdkit.plugin import CellStress, Here, Stiffness, Torn, dot, length, where
+from pbdkit.plugin.table import interpolate
 from pbdkit.plugin.vector import KINDS, Vector
 
 Function = Callable[..., Any]
-_ready: set[Function] = {where, dot}
+_ready: set[Function] = {where, dot, interpolate}
 
 
 def _is_vector(kind: Any) -> bool:
@@ -73,6 +81,74 @@ def _where(condition: Any, yes: Any, no: Any) -> Any:
 def _dot(a: Any, b: Any) -> Any:
     products = " + ".join(f"a.{name} * b.{name}" for name in a.instance_class._fields)
     return _written(a, "a, b", "", products)
+
+
+@overload(interpolate)
+def _interpolate(x: Any, table: Any) -> Any:
+    def value(x: Any, table: Any) -> Any:
+        low, high = 0, table.shape[1] - 1
+        if x >= table[0, high]:
+            return table[1, high]
+        if x <= table[0, 0]:
+            return table[1, 0]
+        while high - low > 1:
+            middle = (low + high) // 2
+            if table[0, middle] <= x:
+                low = middle
+            else:
+                high = middle
+        return table[2, low] * (x - table[0, low]) + table[1, low]
+
+    return value
+
+
+class Word(str):
+    """Word that a parameter of a rule is chosen as. In kernels, its comparisons with `==` and `!=`
+    are constants of the code."""
+
+    __slots__ = ()
+
+
+class WordType(numba.types.Opaque):
+    """Type of one word in kernels."""
+
+    def __init__(self, word: str) -> None:
+        self.word = word
+        super().__init__(name=f"Word({word!r})")
+
+
+register_model(WordType)(models.OpaqueModel)
+
+
+@typeof_impl.register(Word)
+def _type_of_word(value: Word, _: Any) -> WordType:
+    return WordType(str(value))
+
+
+@lower_constant(WordType)
+def _constant_word(context: Any, *_: Any) -> Any:
+    return context.get_dummy_value()
+
+
+def _compared(is_equal: bool) -> Function:
+    """Return the comparison of a word with a text in the code."""
+
+    def true(a: Any, b: Any) -> Any:
+        return True
+
+    def false(a: Any, b: Any) -> Any:
+        return False
+
+    def overloaded(a: Any, b: Any) -> Any:
+        if not (isinstance(a, WordType) and isinstance(b, numba.types.StringLiteral)):
+            return None
+        return true if (a.word == b.literal_value) is is_equal else false
+
+    return overloaded
+
+
+overload(operator.eq, prefer_literal=True)(_compared(is_equal=True))
+overload(operator.ne, prefer_literal=True)(_compared(is_equal=False))
 
 
 @overload(operator.neg)
@@ -327,4 +403,5 @@ def words(made: Callable[[Function], Any]) -> dict[str, Any]:
     kinds: dict[str, Any] = {kind.__name__: kind for kind in KINDS.values()}
     kinds |= {kind.__name__: kind for kind in (Here, Torn, CellStress, Stiffness)}
     numbers = {"int64": np.int64, "real": np.float32, "double": np.float64}
-    return kinds | numbers | {"length": made(length), "namedtuple": namedtuple, "np": np}
+    helpers = {"length": made(length), "namedtuple": namedtuple, "Word": Word, "np": np}
+    return kinds | numbers | helpers

@@ -75,6 +75,9 @@ def module_text(
     if plan.scene.axes == 3:
         lines.append("Vector = SpaceVector")
     lines += [f'{kind} = namedtuple("{kind}", {names!r})' for kind, names in fields.items()]
+    for n, level in enumerate(plan.levels):
+        for m, word in enumerate(level.scene.constants.choices):
+            lines.append(f"Word{n}_{m} = Word({word!r})")
     lines += [line for function in functions for line in function.source]
     lines += ["", "", *head, *("    " + line for line in run.lines)]
     return "\n".join(lines) + "\n"

@@ -27,6 +27,7 @@ from pbdkit.plugin import (
     Softens,
     SoftensCells,
     TearsCells,
+    UsesAngles,
     Vector,
 )
 from pbdkit.plugin.discovery import errors_attributed_to
@@ -35,6 +36,7 @@ from pbdkit.plugin.vector import vector
 from pbdkit.scene.constants import (
     Number,
     Owner,
+    Pairs,
     VisibleNumbers,
     bond_numbers,
     numbers_of,
@@ -65,7 +67,9 @@ class Level:
     number: int
     scene: Scene
     parts: tuple[int, ...]
-    """Number of components of each contribution."""
+    """Number of components of each contribution of a neighbour."""
+    pair_parts: tuple[int, ...] = ()
+    """Number of components of each contribution of a pair of neighbours."""
 
     @cached_property
     def seen(self) -> VisibleNumbers:
@@ -86,8 +90,19 @@ class Level:
 
     @property
     def totals(self) -> list[str]:
-        """Names of the sums of contributions, component by component."""
+        """Names of the sums of contributions of neighbours, component by component."""
         return [f"t{n}" for n in range(sum(self.parts))]
+
+    @property
+    def pair_totals(self) -> list[str]:
+        """Names of the sums of contributions of pairs, component by component."""
+        first = sum(self.parts)
+        return [f"t{first + n}" for n in range(sum(self.pair_parts))]
+
+    @property
+    def pairs(self) -> tuple[Pairs, ...]:
+        """Pairs of slots of each sublattice; none if the rule does not use angles."""
+        return self.scene.constants.pairs
 
 
 MAX_BITS = 32
@@ -413,6 +428,7 @@ FUNCTIONS: dict[type[Any], tuple[str, ...]] = {
     Softens: ("seen",),
     RenewsBonds: ("update",),
     TearsCells: ("torn",),
+    UsesAngles: ("gather_pair",),
 }
 """Elementwise functions of rules and fracture models, by capability."""
 
@@ -422,7 +438,7 @@ def levels_of(scene: Scene) -> tuple[Level, ...]:
     scenes = [scene]
     while inner := scenes[0].inner:
         scenes.insert(0, inner)
-    return tuple(Level(n, of, _parts(of)) for n, of in enumerate(scenes))
+    return tuple(Level(n, of, *_parts(of)) for n, of in enumerate(scenes))
 
 
 def functions_of(levels: Sequence[Level]) -> dict[str, Callable[..., Any]]:
@@ -483,9 +499,10 @@ def _culprit(levels: Sequence[Level], error: BaseException) -> Component:
     return culprit.scene.experiment.rule
 
 
-def _parts(scene: Scene) -> tuple[int, ...]:
-    """Return the number of components of each contribution. Raises an error for results that numpy
-    rejects, since a kernel would accept some of them as numbers."""
+def _parts(scene: Scene) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Return the number of components of each contribution of a neighbour, and of each of a pair.
+    Raises an error for results that numpy rejects, since a kernel would accept some of them as
+    numbers."""
     experiment, evaluator = scene.experiment, Evaluator(scene)
     ones = np.ones(1, experiment.stepping.precision)
     ones_vector: Vector = vector([ones] * scene.axes)
@@ -500,13 +517,15 @@ def _parts(scene: Scene) -> tuple[int, ...]:
                 evaluator.renew_bonds(ones_vector, slot.rest, limits, bond, np.ones(1, bool), cells)
                 evaluator.breaks(ones_vector, slot.rest, limits, bond)
         with errors_attributed_to(experiment.rule, "to compile"):
-            total = evaluator.contribution(
-                ones_vector, ones_vector, evaluator.everywhere([slot])[0]
-            )
+            slots = scene.neighbourhood.slots[0]
+            d, neighbours = [ones_vector] * len(slots), evaluator.everywhere(slots)
+            part = evaluator.contribution(ones_vector, ones_vector, neighbours[0])
+            total = evaluator.total(d, ones_vector, neighbours)
             values = Here(
                 ones_vector, ones_vector, ones_vector, scene.constants.of_particle(*numbers)
             )
             for component in evaluator.move(total, values, ones_vector if scene.loads else None):
                 target(ones, component, ones, experiment.stepping)
             evaluator.renew_particles(total, values, numbers, None)
-    return tuple(len(part) if isinstance(part, Vector) else 1 for part in total)
+    sizes = tuple(len(value) if isinstance(value, Vector) else 1 for value in total)
+    return sizes[: len(part)], sizes[len(part) :]

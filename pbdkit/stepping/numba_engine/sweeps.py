@@ -362,7 +362,12 @@ def parameters(plan: Plan, level: Level) -> list[str]:
 def _rule(level: Level) -> str:
     """Return a line that assigns p, the parameters of the rule at a particle."""
     n = level.number
-    owners = {Owner.SCENE: f"rule{n}[{{n}}]", Owner.FIXED_PARTICLE: "g{n}[j]"}
+    owners = {
+        Owner.SCENE: f"rule{n}[{{n}}]",
+        Owner.FIXED_PARTICLE: "g{n}[j]",
+        Owner.CHOICE: f"Word{n}_{{n}}",
+        Owner.TABLE: f"table{n}_{{n}}",
+    }
     return f"p = Rule{n}({values(level.seen.rule, owners)})"
 
 
@@ -456,11 +461,20 @@ def _gathered(
     plan: Plan, level: Level, r: str, weights: str, there: Iterable[str], into: str, torn: bool
 ) -> str:
     n = level.number
-    names = _pattern(level, [f"{into}{total[1:]}" for total in level.totals], "")
+    names = _pattern(level.parts, [f"{into}{total[1:]}" for total in level.totals], "")
     arguments = ["d", r, f"Weights{n}({weights})", *(["t"] if torn else []), "p"]
     if plan.shares:
         arguments += [f"Own{n}({_own(level)})", f"Own{n}({listed(there)})"]
     return f"{names}, = {'torn' if torn else 'gather'}{n}({', '.join(arguments)})"
+
+
+def _pair_contributions(plan: Plan, level: Level, ends: Sequence[tuple[str, str, str]]) -> str:
+    """Return a line that computes the contributions of a pair of neighbours. For each end, `ends`
+    contains the expressions for d, r and the weights."""
+    n = level.number
+    names = _pattern(level.pair_parts, [f"c{total[1:]}" for total in level.pair_totals], "")
+    (d, r, w), (e, s, v) = ends
+    return f"{names}, = gather_pair{n}({d}, {e}, {r}, {s}, Weights{n}({w}), Weights{n}({v}), p)"
 
 
 def _own(level: Level) -> str:
@@ -481,7 +495,7 @@ def target_lines(
     always moves. `otherwise` is the displacement of a particle that does not move. `local` are the
     components of X relative to site (0, 0)."""
     n, solver = level.number, plan.scene.experiment.stepping
-    sums = _pattern(level, totals, "Vector")
+    sums = _pattern(level.parts + level.pair_parts, totals, "Vector")
     lines = list[str]()
     X = centred = plan.literal([0.0] * len(plan.axes))
     if level.scene.experiment.rule.uses_reference:
@@ -524,10 +538,11 @@ def _chosen_target(value: str, where: str, otherwise: str) -> str:
     return f"{value} if {where} else {otherwise}" if where else value
 
 
-def _pattern(level: Level, names: list[str], kind: str) -> str:
-    """Return the names of components; the names of the components of a vector are combined."""
+def _pattern(parts: Sequence[int], names: list[str], kind: str) -> str:
+    """Return the names of components; the names of the components of a vector are combined. `parts`
+    contains the number of components of each contribution."""
     components, rest = [], iter(names)
-    for size in level.parts:
+    for size in parts:
         group = list(islice(rest, size))
         components.append(group[0] if size == 1 else f"{kind}({', '.join(group)})")
     return ", ".join(components)
@@ -730,12 +745,21 @@ def write_whole(
     out.add(1, *displacements(plan, level))
     if plan.judged:
         out.add(1, f"bits = int64({lost})", "now = bits")
-    for k, slot in enumerate(plan.scene.neighbourhood.slots[s]):
+    slots = plan.scene.neighbourhood.slots[s]
+    for k, slot in enumerate(slots):
         out.add(1, *_slot_lines(plan, level, k, slot, words[k], damage))
+    for e, pair in enumerate(level.pairs[s] if level.pairs else ()):
+        ends = (
+            (f"d{k}", plan.literal(slots[k].rest), _weights(plan, level, slots[k], words[k]))
+            for k in pair
+        )
+        out.add(1, _pair_contributions(plan, level, list(ends)))
+        out.add(1, *_added(plan, level.pair_totals, is_first=e == 0))
     chosen: tuple[str, ...] = ()
     if mark:
         chosen = f"{mark} {'!=' if damage else '=='} 0", "o@[j]"
-    out.add(1, *target_lines(plan, level, plan.local_places(str(s)), level.totals, *chosen))
+    sums = level.totals + level.pair_totals
+    out.add(1, *target_lines(plan, level, plan.local_places(str(s)), sums, *chosen))
     if plan.judged:
         out.add(1, "changed = changed | (now ^ bits)", f"{lost} = now")
 
@@ -776,20 +800,31 @@ def _slot_lines(
     # bond is stored. The results at both ends then agree to the last bit.
     _, is_owner = plan.scene.neighbourhood.owner[slot]
     arguments = f"d, {plan.literal(slot.rest)}" if is_owner else f"-d, {plan.literal(-slot.rest)}"
-    literal = level.scene.constants.weights[slot]._asdict()
-    weights = {name: plan.number(value) for name, value in literal.items()}
-    if words.shares:
-        weights["left"], weights["right"] = words.shares
-    r = plan.literal(slot.rest)
+    weights, r = _weights(plan, level, slot, words), plan.literal(slot.rest)
     return [
         difference(plan, level, words.pattern),
         *bond_lines(plan, k, r, c, f"breaks({arguments}, {c}, q)", words.since),
         *([damage.beside(slot)] if damage else []),
-        contributions(plan, level, r, listed(weights.values()), words.numbers, damage is not None),
-        *(
-            f"t{n} = {f't{n} + ' if k else ''}{plan.rounded(f'c{n}')}"
-            for n in range(len(level.totals))
-        ),
+        contributions(plan, level, r, weights, words.numbers, damage is not None),
+        *_added(plan, level.totals, is_first=k == 0),
+        *([f"d{k} = d"] if level.pairs else []),
+    ]
+
+
+def _weights(plan: Plan, level: Level, slot: Slot, words: Words) -> str:
+    """Return the weights of a slot as arguments of a named tuple."""
+    literal = level.scene.constants.weights[slot]._asdict()
+    weights = {name: plan.number(value) for name, value in literal.items()}
+    if words.shares:
+        weights["left"], weights["right"] = words.shares
+    return listed(weights.values())
+
+
+def _added(plan: Plan, totals: Sequence[str], *, is_first: bool) -> list[str]:
+    """Return lines that add contributions to sums; the first contributions are assigned."""
+    return [
+        f"{total} = {'' if is_first else f'{total} + '}{plan.rounded(f'c{total[1:]}')}"
+        for total in totals
     ]
 
 
@@ -821,6 +856,11 @@ def write_general(plan: Plan, level: Level, events: Function | None) -> Function
     out = Function(plan.shared, f"general{level.number}", "s", *RUNS)
     write_row_loop(out, plan, level, "s")
     out.add(0, f"base = {plan.flat('s')}", "width = j1 - j0")
+    if level.pairs:
+        slots = max(map(len, plan.scene.neighbourhood.slots))
+        size = f"({slots}, {'width' if _is_slot_after_slot(plan) else 1})"
+        out.add(0, *plan.each(f"seen_@ = np.empty({size}, {plan.real})"))
+        out.add(0, f"exists = np.empty({size}, np.uint8)")
     if _is_slot_after_slot(plan):
         _write_slot_after_slot(out, plan, level)
     else:
@@ -834,26 +874,30 @@ def write_general(plan: Plan, level: Level, events: Function | None) -> Function
 def write_one(out: Function, plan: Plan, level: Level) -> None:
     """Write the lines that move one particle of sublattice s, inside a loop over particles."""
     # Sums start from -0.0, because adding it changes neither +0.0 nor -0.0.
-    out.add(1, *(f"{t} = {plan.real}(-0.0)" for t in level.totals), "near, at_j = 0, base + j")
+    sums = level.totals + level.pair_totals
+    out.add(1, *(f"{t} = {plan.real}(-0.0)" for t in sums), "near, at_j = 0, base + j")
     if plan.judged:
         out.add(1, "bits = int64(flat_lost[at_j])", "now = bits")
     if plan.tears:
         out.add(1, *damage_lines(plan))
     out.add(1, *displacements(plan, level), "for k in range(counts[s]):")
     _write_slot(out, plan, level, level.totals, "near")
+    _write_pairs(out, plan, level, level.pair_totals)
     out.add(1, f"moves = (flat_kind[at_j] == {FOLLOWER}) & (near > 0)")
-    out.add(1, *target_lines(plan, level, plan.local_places("s"), level.totals, "moves"))
+    out.add(1, *target_lines(plan, level, plan.local_places("s"), sums, "moves"))
     if plan.judged:
         out.add(1, "changed = changed | (now ^ bits)", "flat_lost[at_j] = now")
 
 
 def _write_slot_after_slot(out: Function, plan: Plan, level: Level) -> None:
-    sums = [f"{t}[j]" for t in level.totals]
+    totals = level.totals + level.pair_totals
+    sums, of_pairs = [f"{t}[j]" for t in totals], [f"{t}[j]" for t in level.pair_totals]
     out.add(0, f"t = np.full(({len(sums)}, width), {plan.number(-0.0)})")
-    out.add(0, *(f"{t} = t[{n}]" for n, t in enumerate(level.totals)))
+    out.add(0, *(f"{t} = t[{n}]" for n, t in enumerate(totals)))
     out.add(0, "near = np.zeros(width, np.int64)", f"kinds = {plan.row('kind', 's')}")
     out.add(0, "for k in range(counts[s]):")
-    _write_slot(out, plan, level, sums, "near[j]")
+    _write_slot(out, plan, level, sums[: len(level.totals)], "near[j]")
+    _write_pairs(out, plan, level, of_pairs)
     out.add(0, "for j in range(width):")
     out.add(1, *displacements(plan, level), f"moves = (kinds[j] == {FOLLOWER}) & (near[j] > 0)")
     out.add(1, *target_lines(plan, level, plan.local_places("s"), sums, "moves"))
@@ -911,6 +955,36 @@ def _write_slot(out: Function, plan: Plan, level: Level, sums: Sequence[str], ne
     for n, t in enumerate(sums):
         out.add(2, f"{t} = {t} + ({plan.rounded(f'c{n}')} if is_there else {plan.number(0.0)})")
     out.add(2, f"{near} = {near} + (1 if is_there else 0)")
+    if level.pairs:
+        at = "j" if _is_slot_after_slot(plan) else "0"
+        out.add(2, *plan.each(f"seen_@[k, {at}] = d.@"), f"exists[k, {at}] = is_there")
+
+
+def _write_pairs(out: Function, plan: Plan, level: Level, sums: Sequence[str]) -> None:
+    """Write a loop over the pairs of neighbours, if the rule uses angles. `seen_@` are the
+    differences that the rule receives along each slot."""
+    if not level.pairs:
+        return
+    n, is_row = level.number, _is_slot_after_slot(plan)
+    depth, at = (0, "j") if is_row else (1, "0")
+    out.add(depth, f"for e in range(pair_counts{n}[s]):")
+    out.add(depth + 1, f"one, other = pair_slots{n}[s, e, 0], pair_slots{n}[s, e, 1]")
+    if is_row:
+        out.add(1, "for j in range(width):")
+        out.add(2, *([_rule(level)] if level.fields else []))
+    ends = []
+    for k in ("one", "other"):
+        owners = {
+            Owner.SLOT: f"weights{n}[s, {k}, {{n}}]",
+            Owner.CELL: f"flat_share[at_j + cells_away[s, {k}, {{n}}]]",
+        }
+        d, r = (plan.vector(v) for v in (f"seen_@[{k}, {at}]", f"rests[s, {k}, #]"))
+        ends.append((d, r, values(level.seen.weights, owners)))
+    out.add(2, f"both = (exists[one, {at}] != 0) & (exists[other, {at}] != 0)")
+    out.add(2, _pair_contributions(plan, level, ends))
+    for total, t in zip(level.pair_totals, sums, strict=True):
+        c = plan.rounded(f"c{total[1:]}")
+        out.add(2, f"{t} = {t} + ({c} if both else {plan.number(0.0)})")
 
 
 def _write_mixed(out: Function, plan: Plan, level: Level, shown: Sequence[str]) -> None:
