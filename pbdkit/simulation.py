@@ -31,6 +31,7 @@ from pbdkit.stability.forecast import further_warnings, prediction, quick_warnin
 from pbdkit.stability.relaxation import tuned
 from pbdkit.stepping.divergence import EVERY, Guard
 from pbdkit.stepping.engine_choice import Choice, choose, make_engine
+from pbdkit.stepping.function_checks import check_functions
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import State, initial_state, unmoved_state
 
@@ -91,6 +92,7 @@ class Driver(ABC):
         self.requested_step = -1
         self.error_bound: ErrorBound | None = None
         self.rejection: FloatingPointError | None = None
+        check_functions(scene, state)
 
     @abstractmethod
     def states(self) -> States:

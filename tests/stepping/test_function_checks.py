@@ -1,0 +1,138 @@
+"""Functions that write into their arguments, or depend on more than these, are found in a run."""
+
+from typing import Literal
+
+import numpy as np
+import pytest
+
+import pbdkit
+from pbdkit.plugin import AppliesTwice, FollowerRule, UsesAngles, Vector, dot
+
+CALLS = []
+
+
+class Plain(FollowerRule):
+    @staticmethod
+    def gather(d, r, w, p):
+        return d, 1.0
+
+    @staticmethod
+    def apply(total, here, p):
+        return total[0] / total[1]
+
+
+class Writes(Plain):
+    type: Literal["writes"] = "writes"
+
+    @staticmethod
+    def gather(d, r, w, p):
+        x = d.y
+        x *= 0.5
+        return Vector(d.x, x), 1.0
+
+
+class WritesTotal(Plain):
+    type: Literal["writes-total"] = "writes-total"
+
+    @staticmethod
+    def apply(total, here, p):
+        x = total[0].x
+        x /= total[1]
+        return Vector(x, total[0].y / total[1])
+
+
+class WritesHere(Plain):
+    type: Literal["writes-here"] = "writes-here"
+
+    @staticmethod
+    def apply(total, here, p):
+        x = here.u.x
+        x += 1.0
+        return total[0] / total[1]
+
+
+class Counts(Plain):
+    type: Literal["counts"] = "counts"
+
+    @staticmethod
+    def gather(d, r, w, p):
+        CALLS.append(1)
+        return d * len(CALLS), 1.0
+
+
+class Draws(Plain):
+    type: Literal["draws"] = "draws"
+
+    @staticmethod
+    def apply(total, here, p):
+        return total[0] * np.random.rand() / total[1]
+
+
+class Norm(Plain):
+    type: Literal["norm"] = "norm"
+
+    @staticmethod
+    def apply(total, here, p):
+        return total[0] / np.sqrt(np.sum(dot(total[0], total[0])) + 1.0)
+
+
+class PairWrites(UsesAngles, Plain):
+    type: Literal["pair-writes"] = "pair-writes"
+
+    @staticmethod
+    def gather_pair(d1, d2, r1, r2, w1, w2, p):
+        x = d1.x
+        x *= 2.0
+        return (d1,)
+
+
+class InnerCounts(AppliesTwice, Plain):
+    type: Literal["inner-counts"] = "inner-counts"
+
+    def inner(self):
+        return Counts()
+
+
+NEW = "make new arrays, `x = x + 1` instead of `x += 1`"
+KEEPS = "in the second of two equal calls: it keeps values from call to call, or draws random"
+FAULTS = {
+    Writes: ("`gather` at the neighbour with the site offset (-1, 0) writes into `d.y`", NEW),
+    WritesTotal: ("`apply` writes into `total`", NEW),
+    WritesHere: ("`apply` writes into its arguments", NEW),
+    Counts: ("`gather` at the neighbour with the site offset", "for particle ", KEEPS),
+    Draws: ("`apply` returned ", "for particle ", KEEPS),
+    Norm: ("`apply` returned ", "is called for this particle alone: it is not elementwise"),
+    PairWrites: ("`gather_pair` writes into its arguments", NEW),
+    InnerCounts: ("FollowerRule 'counts': `gather`", KEEPS),
+}
+
+
+@pytest.mark.parametrize("rule", FAULTS, ids=lambda rule: rule.__name__)
+def test_a_fault_is_found_at_the_beginning_of_a_run(rule):
+    settings = {"rule": {"type": rule.type_name()}, "steps": 3}
+    if rule is InnerCounts:
+        settings["frame"] = {"type": "none"}
+    with pytest.raises(pbdkit.PluginError) as caught:
+        pbdkit.run("paper/a", components=[rule], settings=settings, progress=False)
+    message = str(caught.value)
+    assert [words for words in FAULTS[rule] if words not in message] == [], message
+    assert f"FollowerRule '{'counts' if rule is InnerCounts else rule.type_name()}'" in message
+
+
+def test_a_sound_rule_is_called_for_few_particles():
+    sizes = []
+
+    class Sound(Plain):
+        type: Literal["sound"] = "sound"
+
+        @staticmethod
+        def gather(d, r, w, p):
+            sizes.append(np.size(d.x))
+            return d, 1.0
+
+    body = {"type": "grid", "columns": 400, "rows": 300}
+    settings = {"rule": {"type": "sound"}, "body": body, "steps": 1, "diagnostics": []}
+    pbdkit.run("paper/a", components=[Sound], settings=settings, progress=False)
+    checked = [size for size in sizes if size <= 128]
+    assert sum(checked) < 1e-2 * sum(sizes)
+    assert len(checked) >= 16
