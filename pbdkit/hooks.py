@@ -104,6 +104,17 @@ NO_REFERENCE = (
 """Message about reference positions in rules that do not declare their use."""
 
 
+SLIPS: tuple[tuple[type[Exception], str, str], ...] = (
+    (IndexError, "tuple index out of range",
+     "`total` contains the sums of the values that `gather` and `gather_pair` return"),
+    (TypeError, "can be converted to Python scalars",
+     "use functions of numpy, as `numpy.sqrt`, in place of those of `math`"),
+    (TypeError, "'numpy.ndarray' object is not callable",
+     "a table is evaluated by `interpolate(x, p.name)`"),
+)  # fmt: skip
+"""Frequent errors in elementwise functions: type, words of the message, and remedy."""
+
+
 def worded(error: BaseException, package: str = "", component: type[Any] | None = None) -> str:
     """Return ``Type: message`` of an error in foreign code.
 
@@ -144,12 +155,20 @@ def remedy(error: BaseException, component: type[Any] | None = None) -> str:
     if of_none and not getattr(component, "uses_reference", True):
         return f"; {NO_REFERENCE}"
     if not isinstance(error, AttributeError):
-        return ""
+        slips = (
+            f"; {advice}"
+            for kind, words, advice in SLIPS
+            if isinstance(error, kind) and words in str(error)
+        )
+        return next(slips, "")
     name, kind = str(error.name), type(error.obj).__name__
+    if kind in ("Vector", "SpaceVector"):
+        return f"; vectors have the components {', '.join(error.obj._fields)}"
     if kind in NUMBERS and component and name in component.model_fields:
         return (
             f"; `{NUMBERS[kind]}` contains numbers, and the parameter '{name}' is not a number: "
-            "convert it in `parameters` or `weights`"
+            "convert it in `parameters` or `weights`, or declare it as `Literal[...]` (words) or "
+            "`Table` (points)"
         )
     names = [n for n in getattr(error.obj, "_fields", dir(error.obj)) if not n.startswith("_")]
     content = ""

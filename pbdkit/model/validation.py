@@ -128,6 +128,7 @@ MAX_FAULTS = 8
 PLAIN = {
     "missing": "is missing",
     "tuple_type": "should be a list, got {got}",
+    "dict_type": "should be a map of keys, got {got}",
     "too_long": "should have at most {max_length} items, got {actual_length}",
     "too_short": "should have at least {min_length} item(s), got {actual_length}",
     "model_type": "should be a map of keys, got {got}",
@@ -162,7 +163,7 @@ def _described(fault: Any) -> tuple[tuple[str | int, ...], str]:
         return (*where, *(key if isinstance(key, tuple) else (key,))), context["text"]
     if fault["type"] in PLAIN:
         text = PLAIN[fault["type"]].format(got=brief(fault["input"]), **context)
-        return where, text + _decimal_commas(fault)
+        return where, text + (_decimal_commas(fault) or _as_list(fault))
     message = fault["msg"].removeprefix("Value error, ").replace("Input should", "should")
     if fault["type"] == "value_error":
         return where, message
@@ -179,8 +180,24 @@ def _described(fault: Any) -> tuple[tuple[str | int, ...], str]:
     return where, f"{message}, got {brief(value)}{hint}"
 
 
+def _as_list(fault: Any) -> str:
+    """Return a hint if a value is given where a list is expected."""
+    value = fault["input"]
+    if fault["type"] != "tuple_type" or value is None:
+        return ""
+    if isinstance(value, dict):
+        return "; write `- ` before each entry, also if there is one"
+    return f"; write [{value:g}]" if isinstance(value, (int, float)) else f"; write [{value}]"
+
+
+FRACTION = re.compile(r"\s*(\d+(?:\.\d*)?)\s*/\s*(\d+(?:\.\d*)?)\s*")
+"""Pattern of a fraction."""
+
+
 def _meant_number(text: str) -> str:
     """Return a hint if text is a number in another notation."""
+    if (fraction := FRACTION.fullmatch(text)) and float(fraction[2]):
+        return f"; write {float(fraction[1]) / float(fraction[2]):.12g}"
     number = text.strip().replace(",", ".", 1)
     share = number.endswith("%")
     with suppress(ValueError):
@@ -190,12 +207,13 @@ def _meant_number(text: str) -> str:
 
 
 def _decimal_commas(fault: Any) -> str:
-    """Return a hint if a list has twice as many integers as expected, as in ``[0,01, 0,0]``."""
+    """Return a hint if a list has integers in place of decimals, as in ``[0,01, 0.0]``."""
     items, maximum = fault["input"], fault.get("ctx", {}).get("max_length")
     if fault["type"] != "too_long" or not isinstance(items, (list, tuple)):
         return ""
-    doubled = len(items) == 2 * maximum and all(type(item) is int for item in items)
-    return "; write decimals with a point instead of a comma, as in 0.01" if doubled else ""
+    integers = sum(type(item) is int for item in items)
+    is_split = integers >= 2 and (integers < len(items) or len(items) == 2 * maximum)
+    return "; write decimals with a point instead of a comma, as in 0.01" if is_split else ""
 
 
 def _bound(context: Any) -> float:
@@ -260,7 +278,9 @@ def _build(value: Any, base: type[Component], find: Finder, info: ValidationInfo
     if isinstance(value, base):
         return value
     if not isinstance(value, dict):
-        raise fault(f"expected {{type: ..., its parameters}}, got {brief(value)}")
+        meant = isinstance(value, str) and value.isprintable() and len(value) <= MAX_TYPE
+        hint = f"; write {{type: {value}}}" if meant else ""
+        raise fault(f"expected {{type: ..., its parameters}}, got {brief(value)}{hint}")
     name = value.get("type")
     if name is None:
         raise fault("`type` is missing")

@@ -214,7 +214,7 @@ class Remembered:
     recorded: bool = True
 
     def __post_init__(self) -> None:
-        if not self.name.isidentifier():
+        if not isinstance(self.name, str) or not self.name.isidentifier():
             raise ValueError(
                 f"'{self.name}' is not a valid name of a variable; use letters, digits and _"
             )
@@ -222,7 +222,7 @@ class Remembered:
             raise ValueError(
                 f"'{self.name}' has the dtype '{self.dtype}'; expected one of {', '.join(DTYPES)}"
             )
-        if np.ndim(self.initial):
+        if isinstance(self.initial, str) or np.ndim(self.initial):
             raise ValueError(
                 f"the initial value of '{self.name}' is {self.initial!r}, not a number; declare "
                 f"one number for each component, as {self.name}_x and {self.name}_y"

@@ -44,6 +44,10 @@ class Variable:
     dtype: str = "f8"
     attributes: dict[str, Any] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        if isinstance(self.dims, str):
+            raise TypeError(f"the dims of '{self.name}' are a text; write ('{self.dims}',)")
+
     def is_recordable(self, values: Any, inside: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Return a mask of the values that are allowed in the dataset.
 

@@ -227,6 +227,10 @@ def _given(components: Iterable[type[Component]], builtin: Plugin) -> Plugin:
     ExperimentError
         If a class is not usable.
     """
+    if not isinstance(components, Iterable):
+        raise ExperimentError(
+            f"components: expected a list of classes, as [MyRule], got {components!r:.60}"
+        )
     try:
         offers = tuple(dict.fromkeys(map(checked, components)))  # unique, in their order
     except TypeError as error:

@@ -16,6 +16,7 @@ from pydantic import (
 )
 from pydantic_core import core_schema
 
+from pbdkit.errors import AnswerError
 from pbdkit.plugin.component import Component, Pair
 from pbdkit.plugin.units import Quantity, number_or_text
 from pbdkit.plugin.vector import Number
@@ -180,6 +181,8 @@ def interpolate(x: Number, table: Any) -> Any:
     >>> float(interpolate(2.0, Table([(0.0, 1.0), (4.0, 3.0)]).array))
     2.0
     """
+    if np.ndim(table) != 2:
+        raise AnswerError("`interpolate` takes the argument and then the table, as in (x, p.name)")
     argument = np.asarray(x)
     if argument.dtype == np.float32:
         table = table.astype(np.float32)

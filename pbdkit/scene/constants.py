@@ -508,8 +508,16 @@ def _named(
         raise TypeError(
             f"it returned {type(values).__name__}; return numbers by name: {{'k': 1.0}}"
         )
-    names = (*values, *constants)
-    return _kind(kind, names)(*map(convert, (*values.values(), *constants.values())))
+    numbers = {**values, **constants}
+    for name, value in numbers.items():
+        try:
+            numbers[name] = convert(value)
+        except (TypeError, ValueError):
+            raise TypeError(
+                f"it returned {type(value).__name__} as '{name}', not a number; return one number "
+                f"for each component, as {name}_x and {name}_y"
+            ) from None
+    return _kind(kind, tuple(numbers))(*numbers.values())
 
 
 @cache

@@ -62,7 +62,10 @@ def target(u: Any, move: Any, before: Any, solver: Stepping) -> Any:
             "it is not elementwise"
         )
     if not isinstance(move, float) and np.asarray(move).dtype.kind not in REAL:
-        raise ValueError(f"it returned values of {np.asarray(move).dtype}, not real numbers")
+        raise ValueError(
+            f"it returned values of {np.asarray(move).dtype}, not real numbers; return numbers of "
+            "type float"
+        )
     place = u + (move if solver.relaxation == 1.0 else solver.relaxation * move)
     return place + solver.memory * (u - before) if solver.memory != 0.0 else place
 

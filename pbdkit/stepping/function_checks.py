@@ -130,7 +130,7 @@ def _answers(around: Surroundings, scene: Scene, u: Floats, state: State) -> Ite
     pairs = _called(rule, "`gather_pair`", lambda: list(evaluate()))
     yield from (Answer("`gather_pair`", _flat(part)) for part, _ in pairs)
     total = summed(parts) + summed(pairs)
-    functions = {"`apply`": evaluator.move}
+    functions: dict[str, Callable[..., Any]] = {"`apply`": evaluator.move}
     if isinstance(rule, RenewsParticles):
         functions["`remember`"] = evaluator.remember
     _frozen(particle)

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.array_types import Mask
+from pbdkit.errors import AnswerError
 from pbdkit.lattice.cells import CellBond, WeighedCells
 from pbdkit.lattice.raster import EMPTY, FOLLOWER, Raster, Where
 from pbdkit.plugin import (
@@ -258,6 +259,11 @@ def summed(parts: Iterable[tuple[Contributions, Mask | None]]) -> Contributions:
     for part, present in parts:
         if present is not None:
             part = tuple(_masked(value, present) for value in part)
+        if total is not None and len(part) != len(total):
+            raise AnswerError(
+                f"`gather` or `gather_pair` returned {len(total)} values for a neighbour and "
+                f"{len(part)} for another; return equally many, for instance 0.0"
+            )
         total = part if total is None else tuple(a + b for a, b in zip(total, part, strict=True))
     return total or ()
 
