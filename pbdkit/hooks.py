@@ -163,7 +163,7 @@ def remedy(error: BaseException, component: type[Any] | None = None) -> str:
         return next(slips, "")
     name, kind = str(error.name), type(error.obj).__name__
     if kind in ("Vector", "SpaceVector"):
-        return f"; vectors have the components {', '.join(error.obj._fields)}"
+        return f"; vectors have the components {', '.join(vars(type(error.obj))['_fields'])}"
     if kind in NUMBERS and component and name in component.model_fields:
         return (
             f"; `{NUMBERS[kind]}` contains numbers, and the parameter '{name}' is not a number: "

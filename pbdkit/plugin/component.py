@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -214,7 +214,8 @@ class Remembered:
     recorded: bool = True
 
     def __post_init__(self) -> None:
-        if not isinstance(self.name, str) or not self.name.isidentifier():
+        name, initial = cast(Any, self.name), cast(Any, self.initial)
+        if not isinstance(name, str) or not name.isidentifier():
             raise ValueError(
                 f"'{self.name}' is not a valid name of a variable; use letters, digits and _"
             )
@@ -222,7 +223,7 @@ class Remembered:
             raise ValueError(
                 f"'{self.name}' has the dtype '{self.dtype}'; expected one of {', '.join(DTYPES)}"
             )
-        if isinstance(self.initial, str) or np.ndim(self.initial):
+        if isinstance(initial, str) or np.ndim(initial):
             raise ValueError(
                 f"the initial value of '{self.name}' is {self.initial!r}, not a number; declare "
                 f"one number for each component, as {self.name}_x and {self.name}_y"

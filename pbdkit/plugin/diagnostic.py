@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +45,7 @@ class Variable:
     attributes: dict[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if isinstance(self.dims, str):
+        if isinstance(cast(Any, self.dims), str):
             raise TypeError(f"the dims of '{self.name}' are a text; write ('{self.dims}',)")
 
     def is_recordable(self, values: Any, inside: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -182,7 +182,7 @@ class FollowerRule(TakesFields):
             for name, field in fields
             if get_origin(field.annotation) is Literal and isinstance(field.default, str)
         }
-        del words["type"]
+        words.pop("type", None)
         tables = {name: getattr(self, name) for name in tables_of(type(self))}
         return self.numeric_parameters() | words | tables
 

@@ -45,6 +45,7 @@ CAPABILITIES = {
         pbdkit.plugin.SharesParticles,
         pbdkit.plugin.TurnsParticles,
         pbdkit.plugin.AppliesTwice,
+        pbdkit.plugin.UsesAngles,
     ),
     "FractureModel": (
         pbdkit.plugin.Remembers,
