@@ -23,7 +23,13 @@ from pbdkit.plugin import Here, Slot, Softens, SoftensCells, UsesAngles, Vector
 from pbdkit.plugin.discovery import errors_attributed_to
 from pbdkit.plugin.vector import vector
 from pbdkit.scene.scene import Scene
-from pbdkit.stepping.rule_evaluation import Contributions, Evaluator, Surroundings, summed
+from pbdkit.stepping.rule_evaluation import (
+    Contributions,
+    Evaluator,
+    Surroundings,
+    refuse_other_count,
+    summed,
+)
 from pbdkit.stepping.state import State
 
 Present = NDArray[np.bool_]
@@ -295,6 +301,8 @@ class _Followers:
                 )
                 for d, to in self._neighbours
             ]
+            for part in parts:
+                refuse_other_count(part, parts[0])
             return tuple(self._total(values, 1 + axes) for values in zip(*parts, strict=True))
 
     def _totals_of_pairs(self, step: complex) -> Contributions:

@@ -176,6 +176,11 @@ def interpolate(x: Number, table: Any) -> Any:
     Number
         Value, in the precision of x.
 
+    Raises
+    ------
+    AnswerError
+        If the arguments are in the reverse order.
+
     Examples
     --------
     >>> float(interpolate(2.0, Table([(0.0, 1.0), (4.0, 3.0)]).array))

@@ -82,7 +82,7 @@ def _check(scene: Scene, state: State) -> None:
         )
     except PluginError:
         raise
-    except Exception:  # The run reports the error, with the step.
+    except (Exception, SystemExit):  # The run reports the error, with the step.
         return
     for answer, other in zip(first, second, strict=True):
         _refuse_difference(
@@ -182,7 +182,8 @@ def _number(scene: Scene, place: int) -> int:
 
 
 def _fault(rule: FollowerRule, text: str) -> PluginError:
-    return PluginError(f"{full_description(type(rule))}: {text}")
+    who = full_description(type(rule))
+    return PluginError(f"{who} failed at the beginning of the run: {text}")
 
 
 def _flat(tree: Any) -> list[Any]:

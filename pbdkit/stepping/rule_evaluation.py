@@ -259,13 +259,19 @@ def summed(parts: Iterable[tuple[Contributions, Mask | None]]) -> Contributions:
     for part, present in parts:
         if present is not None:
             part = tuple(_masked(value, present) for value in part)
-        if total is not None and len(part) != len(total):
-            raise AnswerError(
-                f"`gather` or `gather_pair` returned {len(total)} values for a neighbour and "
-                f"{len(part)} for another; return equally many, for instance 0.0"
-            )
+        refuse_other_count(part, part if total is None else total)
         total = part if total is None else tuple(a + b for a, b in zip(total, part, strict=True))
     return total or ()
+
+
+def refuse_other_count(part: Contributions, other: Contributions) -> None:
+    """Raise AnswerError if two neighbours, or two pairs, have different numbers of
+    contributions."""
+    if len(part) != len(other):
+        raise AnswerError(
+            f"`gather` or `gather_pair` returned {len(other)} values for a neighbour and "
+            f"{len(part)} for another; return equally many, for instance 0.0"
+        )
 
 
 def _both(one: Mask | None, other: Mask | None) -> Mask | None:

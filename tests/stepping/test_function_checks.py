@@ -103,7 +103,7 @@ FAULTS = {
     Draws: ("`apply` returned ", "for particle ", KEEPS),
     Norm: ("`apply` returned ", "is called for this particle alone: it is not elementwise"),
     PairWrites: ("`gather_pair` writes into its arguments", NEW),
-    InnerCounts: ("FollowerRule 'counts': `gather`", KEEPS),
+    InnerCounts: ("FollowerRule 'counts' failed at the beginning of the run: `gather`", KEEPS),
 }
 
 
