@@ -94,9 +94,9 @@ MAX_DPI = 2400
 
 
 Norm = Literal["linear", "log", "sqrt", "symlog"]
-"""Scale of colours."""
+"""Names of scales of colours, as in matplotlib."""
 Limits = Literal["all", "each"]
-"""Whether limits of colours belong to all drawn steps, or to each of them."""
+"""Scope of the limits of colours: all drawn steps, or each of them."""
 
 
 @dataclass(frozen=True)
