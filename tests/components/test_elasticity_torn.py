@@ -96,7 +96,7 @@ def stiffness(scene, state):
     return np.array(columns).T
 
 
-@samples(25)
+@samples(12)
 @given(torn_bodies())
 def test_forces_derive_from_a_stiffness_without_rigid_motions(torn):
     scene, state, generator = torn

@@ -17,7 +17,7 @@ from property_cases import (
     followers_of,
     scene_of,
 )
-from scene_strategies import lattices, neighbours
+from scene_strategies import AT_LENGTH, lattices, neighbours
 
 import pbdkit
 from pbdkit.linear.stencil import wave_bound
@@ -153,7 +153,7 @@ def half_period(analysis):
 
 
 thoroughly = settings(
-    max_examples=12,
+    max_examples=12 if AT_LENGTH else 6,
     derandomize=True,
     deadline=None,
     phases=[Phase.explicit, Phase.generate],
@@ -173,7 +173,7 @@ def test_runs_converge_and_diverge_at_the_predicted_rate(parts, seed):
     assert 1 / FIVE_PERCENT < excess(scene, analysis, seed) < FIVE_PERCENT
 
 
-@settings(thoroughly, max_examples=15)
+@settings(thoroughly, max_examples=15 if AT_LENGTH else 8)
 @given(scenes())
 def test_bodies_are_stable_if_the_wave_bound_is(parts):
     """Compare the estimate of `run`, in milliseconds, with that of `check`."""
