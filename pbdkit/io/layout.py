@@ -45,6 +45,8 @@ ATTRIBUTES = (
 """Names of the attributes of every dataset."""
 INDICES = "ijk"
 """Names of the indices of a site, one for each axis of the lattice."""
+PLACES = "XYZ"
+"""Names of the coordinates with the components of the reference position."""
 OF_BODY = np.int8(0)
 """Role of the particles of the body, which are leaders and followers."""
 OF_FRAME = np.int8(1)
@@ -146,6 +148,10 @@ def base_columns(axes: int = 2) -> list[Column]:
         coordinate("axis", "axis", "str"),
         coordinate("site", "site indices", "i4", (*each, "index")),
         coordinate("reference", "reference position", "f8", (*each, "axis"), units=LENGTH.lattice),
+        *(
+            coordinate(name, f"reference position {name}", "f8", each, units=LENGTH.lattice)
+            for name in PLACES[:axes]
+        ),
         Column("position", ("time", *each, "axis"), "f8", on, "position", LENGTH.lattice),
         Column(
             "kind", ("time", *each), "i1", on, "kind of the particle", extra=kinds, comment=timing
@@ -306,8 +312,8 @@ def refuse_no_dataset(candidate: Any) -> None:
 
 
 def in_this_layout(dataset: xarray.Dataset) -> xarray.Dataset:
-    """Return the dataset in the current layout. Older datasets do not contain the indices and roles
-    of particles, and identify the particles of a bond by an index that begins at 0 instead of the
+    """Return the dataset in the current layout. Older datasets do not contain the indices, roles
+    and components of the reference positions of particles, and identify the particles of a bond by an index that begins at 0 instead of the
     particle number. In the converted dataset all particles of the body count as lying inside its
     outline.
 
@@ -326,6 +332,9 @@ def in_this_layout(dataset: xarray.Dataset) -> xarray.Dataset:
     role = new.get("role", variables.get("role"))
     if role is not None and "inside" not in variables:
         new["inside"] = (role.dims, role.values == OF_BODY)
+    if dims.get("reference") == ("particle", "axis") and "X" not in variables:
+        axes = zip(PLACES, range(dataset.sizes["axis"]), strict=False)
+        new |= {name: variables["reference"].isel(axis=n) for name, n in axes}
     if dims.get("bond") == ("bond", "end"):
         new["bond_ends"] = variables["bond"] + 1
         places = {"crack_bond": variables["crack_bond"] + 1} if "crack_bond" in variables else {}

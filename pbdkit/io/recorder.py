@@ -265,7 +265,8 @@ class Recorder:
         yield {"site": site, **dict(zip(layout.INDICES, site.T, strict=False))}
         yield {"role": np.where(raster.table_kind == FRAME, layout.OF_FRAME, layout.OF_BODY)}
         yield {"inside": self._tables.inside.astype(np.int8)}
-        yield {"reference": raster.reference()}
+        reference = raster.reference()
+        yield {"reference": reference, **dict(zip(layout.PLACES, reference.T, strict=False))}
         if scene.experiment.shows_bonds:
             bonds = scene.bonds
             yield {"bond": np.arange(1, len(bonds.ends) + 1, dtype=np.int32), "shell": bonds.shell}

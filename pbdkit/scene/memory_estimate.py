@@ -202,7 +202,7 @@ def _output(experiment: Experiment, particles: int, planes: float) -> int:
     records = experiment.record_count
     steps = experiment.steps + 1 if experiment.solver.makes_steps else records
     each_bond = 4 + 2 * 4 + 1 + 12 * experiment.parts_bonds
-    once: float = (1 + bool(experiment.units)) * 2 * 8 + 2 * 2 * 4 + 2 * 8 + 2
+    once: float = (1 + bool(experiment.units)) * 4 * 8 + 2 * 2 * 4 + 2 * 8 + 2
     once += experiment.shows_bonds * planes * each_bond
     growing = [(records, particles * size) for size in (2.0 * recorded, 1.0)] + [(records, 8.0)]
     of_bonds = (bond_numbers(experiment), planes, isinstance(fracture, RenewsBonds))

@@ -25,6 +25,8 @@ BASE = {
     "inside": (("particle",), "bool"),
     "site": (("particle", "index"), None),
     "reference": (("particle", "axis"), "float64"),
+    "X": (("particle",), "float64"),
+    "Y": (("particle",), "float64"),
     "position": (("time", "particle", "axis"), "float64"),
     "kind": (("time", "particle"), "int8"),
     "bond": (("bond",), "int32"),
