@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec, TypeVar
 
 import xarray
 
+from pbdkit.errors import ExperimentError
 from pbdkit.io.layout import (
+    TIMES,
     experiment_of,
     in_this_layout,
     indices_of,
@@ -23,12 +25,15 @@ from pbdkit.plotting import animate, animation, compare, crack, curve, history, 
 from pbdkit.plotting.style import figure_of
 
 if TYPE_CHECKING:
+    import pandas
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from pbdkit.model.experiment import Experiment
     from pbdkit.plugin import Component
 
+REPEATED = ("number", "reference_x", "reference_y", "reference_mm_x", "reference_mm_y")
+"""Coordinates of particles that a table omits, with the values of `particle`, `X` and `Y`."""
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -192,6 +197,53 @@ class PbdAccessor:
                 part.attrs["long_name"] = f"{part.attrs.get('long_name', name)}, {axis} component"
                 labels += [f"{name}_{axis}"] if name in dataset.coords else []
         return dataset.drop_dims("axis", errors="ignore").assign(parts).set_coords(labels)
+
+    def to_dataframe(self, dim: str = "particle") -> pandas.DataFrame:
+        """Convert the variables of one kind of objects to a table.
+
+        Parameters
+        ----------
+        dim : str
+            Dimension of the objects, such as "particle", "bond", "leader_group" or "crack". With
+            "time" or "step", the table contains the quantities of the whole body.
+
+        Returns
+        -------
+        pandas.DataFrame
+            Table with a row for each object and, if a variable depends on time, each recorded time;
+            both are in the index. The columns are the variables that have no further dimension,
+            the components of vectors and principal values, and coordinates of the objects.
+            Quantities of other objects are omitted. The size is that of these variables, unlike
+            that of ``ds.to_dataframe()``, which combines all dimensions.
+
+        Raises
+        ------
+        ExperimentError
+            If no variable has this dimension.
+
+        Examples
+        --------
+        >>> ds = pbdkit.run("paper/a", settings={"steps": 20}, progress=False)
+        >>> table = ds.pbd.to_dataframe()
+        >>> table.loc[(20, 67), ["X", "Y", "position_x"]].to_list()[:2]
+        [4.0, 5.0]
+        """
+        parts = self.components()
+        dims = {dim} if dim in TIMES else {dim, "time"}
+        columns = [n for n, v in parts.data_vars.items() if dim in v.dims and {*v.dims} <= dims]
+        if not columns:
+            names = ", ".join(sorted({str(d) for v in parts.data_vars.values() for d in v.dims}))
+            raise ExperimentError(f"no variable has only the dimension '{dim}'; it has: {names}")
+        coordinates = [
+            name
+            for name, v in parts.coords.items()
+            if v.dims == (dim,) and name not in (*REPEATED, *parts.dims)
+        ]
+        table = parts[[*coordinates, *columns]].reset_coords(coordinates)
+        used = {str(d) for d in table.dims}
+        order = [d for d in ("time", dim) if d in used]
+        kept = table.drop_vars([n for n in table.coords if n not in order])
+        return kept.to_dataframe(dim_order=[*dict.fromkeys(order)])
 
     def physical(self) -> xarray.Dataset:
         """Convert the dataset to mm, MPa, N and mJ.

@@ -32,10 +32,11 @@ if TYPE_CHECKING:
     import xarray
 
 
-CONVENTIONS = "CF-1.11"
-"""Version of the CF conventions."""
 SCHEMA_VERSION = "2"
 """Version of the layout."""
+CONVENTIONS = f"pbdkit-{SCHEMA_VERSION}"
+"""Conventions of the layout. Names of attributes are those of CF, but the CF conventions do not
+allow units such as "lattice unit" and "step"."""
 STATUSES = ("complete", "settled", "diverged", "unconverged", "separated", "interrupted")
 """Values of the attribute `status`."""
 ATTRIBUTES = (
@@ -312,10 +313,10 @@ def refuse_no_dataset(candidate: Any) -> None:
 
 
 def in_this_layout(dataset: xarray.Dataset) -> xarray.Dataset:
-    """Return the dataset in the current layout. Older datasets do not contain the indices, roles
-    and components of the reference positions of particles, and identify the particles of a bond by an index that begins at 0 instead of the
-    particle number. In the converted dataset all particles of the body count as lying inside its
-    outline.
+    """Return the dataset in the current layout. Older datasets do not contain the indices and roles
+    of particles and the components of their reference positions, and identify the particles of a
+    bond by an index that begins at 0 instead of the particle number. In the converted dataset all
+    particles of the body count as lying inside its outline.
 
     Diagnostics are not changed: at frame points they remain 0, although they are NaN in the current
     layout. Raises ExperimentError if the argument is not a dataset.
@@ -425,6 +426,28 @@ def indices_of(dataset: xarray.Dataset) -> list[str]:
     """Return the names of the lattice indices by which particles can be selected."""
     variables = dataset.variables
     return [name for name in INDICES if name in variables and variables[name].dims == ("particle",)]
+
+
+MATCHINGS = ("number", "site")
+"""Properties by which the particles of several datasets are matched."""
+
+
+def refuse_unknown_matching(by: str) -> None:
+    """Raise ExperimentError if the property is not one of MATCHINGS."""
+    if by not in MATCHINGS:
+        raise ExperimentError(f"by: expected 'number' or 'site', got {by!r}")
+
+
+def site_keys(dataset: xarray.Dataset) -> Array:
+    """Return one integer for each particle, (particle,), which is unique for its site (i, j).
+
+    Raises ExperimentError if the dataset contains no site indices.
+    """
+    names = indices_of(dataset)
+    if len(names) < 2:
+        raise ExperimentError("the particles of a dataset have no site indices i and j")
+    i, j = (dataset.variables[name].values.astype(np.int64) for name in names[:2])
+    return np.asarray((i << 32) + j)
 
 
 def rows_at(dataset: xarray.Dataset, index: Mapping[str, int]) -> Array:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pbdkit.errors import PluginError
-from pbdkit.io.layout import Column, Values
+from pbdkit.io.layout import STEP, Column, Values
 from pbdkit.plugin import Diagnostic, Variable
 from pbdkit.plugin.units import LENGTH, QUANTITIES, Quantity, Units, given_by_units
 
@@ -124,10 +124,14 @@ class ConvertedCopies:
 
 def in_physical_units(dataset: xarray.Dataset) -> xarray.Dataset:
     """Return the dataset in physical units: every variable with a scale is converted and keeps its
-    name."""
+    name. If there is such a variable, steps are dimensionless, so that all units are those of
+    UDUNITS."""
     converted = dataset.drop_vars([n for n, v in dataset.variables.items() if TWIN_OF in v.attrs])
+    is_physical = any(UNITS in variable.attrs for variable in converted.variables.values())
     for name, variable in converted.variables.items():
         attributes: dict[Any, Any] = dict(variable.attrs)
+        if is_physical and attributes.get("units") == STEP:
+            converted[name].attrs |= {"units": "1", "lattice_units": STEP}
         if UNITS in attributes and FACTOR in attributes:
             factor = float(attributes.pop(FACTOR))
             attributes |= {"units": attributes.pop(UNITS), "lattice_units": attributes["units"]}

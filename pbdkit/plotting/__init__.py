@@ -7,7 +7,7 @@ called, because matplotlib is an optional dependency.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from pbdkit.errors import refuse_no_matplotlib
 from pbdkit.plotting.movie import animate, animation
@@ -125,6 +125,7 @@ def compare(
     time: float | None = None,
     *,
     difference: bool = False,
+    by: Literal["number", "site"] = "number",
     filled: bool | None = None,
     contours: bool = False,
     bonds: bool | None = None,
@@ -154,7 +155,11 @@ def compare(
         Recorded step; by default the last of each run.
     difference : bool
         Draw in one panel the values of `second` minus those of `first`, at the reference positions
-        of `second`. Particles are matched by number.
+        of `second`.
+    by : {"number", "site"}
+        Match the particles of a difference by number, or by site indices (i, j). In bodies of
+        different shape the same number denotes particles at different sites, of which a warning is
+        issued.
     filled : bool, optional
         True draws the variable as a filled field, False as a dot for each particle. By default a
         field is drawn where dots would overlap.
@@ -207,7 +212,7 @@ def compare(
     refuse_no_matplotlib()
     from pbdkit.plotting.configuration import draw_comparison
 
-    return draw_comparison(first, second, color, time, look, difference=difference)
+    return draw_comparison(first, second, color, time, look, difference=difference, by=by)
 
 
 def plot_experiment(

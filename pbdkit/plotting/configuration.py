@@ -15,8 +15,8 @@ import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.transforms import ScaledTranslation
 
-from pbdkit.errors import ExperimentError
-from pbdkit.io.layout import in_this_layout
+from pbdkit.errors import ExperimentError, SceneWarning, warn_caller
+from pbdkit.io.layout import in_this_layout, indices_of, refuse_unknown_matching, site_keys
 from pbdkit.plotting.colours import (
     OF_KINDS,
     Palette,
@@ -104,12 +104,14 @@ def draw_comparison(
     look: PlotOptions,
     *,
     difference: bool,
+    by: str,
 ) -> Axes | list[Axes]:
     """Draw one step of two datasets, or their difference, in the same way as
     `pbdkit.plotting.compare`."""
     first, second = in_this_layout(first), in_this_layout(second)
+    refuse_unknown_matching(by)
     if difference:
-        changed, name = difference_of(first, second, color or "position", time)
+        changed, name = difference_of(first, second, color or "position", time, by)
         return draw(changed, name, None, look)
     return _side_by_side([first, second], color, time, look)
 
@@ -133,11 +135,16 @@ def _side_by_side(
 
 
 def difference_of(
-    first: xarray.Dataset, second: xarray.Dataset, color: str, time: float | None
+    first: xarray.Dataset,
+    second: xarray.Dataset,
+    color: str,
+    time: float | None,
+    by: str = "number",
 ) -> tuple[xarray.Dataset, str]:
     """Return a dataset for drawing a difference, and the name of the variable to draw. The dataset
-    is the second one at one step, in the reference configuration. It is restricted to particle
-    numbers that both datasets contain, and the difference in `color` is an additional variable."""
+    is the second one at one step, in the reference configuration. It is restricted to particles
+    that both datasets contain, matched `by` "number" or "site", and the difference in `color` is an
+    additional variable."""
     runs = [of_one_run(dataset) for dataset in (first, second)]
     quantity, _ = (quantity_of(dataset, color) for dataset in reversed(runs))
     if quantity.owner != "particle":
@@ -145,10 +152,7 @@ def difference_of(
             f"difference: expected a variable of particles, but '{color}' is one of bonds"
         )
     states = [d.isel(time=Trajectory(d).row(time)) for d in runs]
-    numbers = np.intersect1d(states[0]["number"].values, states[1]["number"].values)
-    if not len(numbers):
-        raise ExperimentError("the two datasets have no particle in common")
-    a, b = (d.isel(particle=np.flatnonzero(np.isin(d["number"], numbers))) for d in states)
+    a, b = matched(states[0], states[1], by)
     minuend, subtrahend = (d[quantity.variable].transpose("particle", "axis", missing_dims="ignore")
                      for d in (a, b))  # fmt: skip
     difference = subtrahend.variable.copy(data=subtrahend.values.astype(float) - minuend.values)
@@ -160,6 +164,35 @@ def difference_of(
     dataset = b.assign(difference=difference, position=b["position"].copy(data=rest))
     name = f"difference{color.removeprefix(quantity.variable)}"
     return dataset.assign_attrs(title=title), name
+
+
+def matched(
+    first: xarray.Dataset, second: xarray.Dataset, by: str
+) -> tuple[xarray.Dataset, xarray.Dataset]:
+    """Return the particles that both datasets contain, matched `by` "number" or "site", in the same
+    order. A warning is issued if equal numbers denote different sites. Raises ExperimentError if
+    there is no such particle."""
+    keys, others = (d["number"].values if by == "number" else site_keys(d) for d in (first, second))
+    _, in_first, in_second = np.intersect1d(keys, others, assume_unique=True, return_indices=True)
+    if not len(in_first):
+        raise ExperimentError("the two datasets have no particle in common")
+    a, b = first.isel(particle=in_first), second.isel(particle=in_second)
+    if by == "number" and indices_of(first) and indices_of(second):
+        _warn_of_other_sites(a, b)
+    return a, b
+
+
+def _warn_of_other_sites(first: xarray.Dataset, second: xarray.Dataset) -> None:
+    differ = np.flatnonzero(site_keys(first) != site_keys(second))
+    if len(differ):
+        row = differ[0]
+        places = [tuple(int(d[n][row]) for n in indices_of(d)) for d in (first, second)]
+        warn_caller(
+            f"difference: {len(differ)} of {len(first.number)} particles have another site under "
+            f"the same number: particle {int(first.number[row])} is at {places[0]} in the first "
+            f'run and at {places[1]} in the second; match by sites with by="site"',
+            SceneWarning,
+        )
 
 
 MIN_DOT_SPACING_PT = 8.0

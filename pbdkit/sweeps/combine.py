@@ -4,14 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from math import prod
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import xxhash
 
 from pbdkit.array_types import Array
 from pbdkit.errors import ExperimentError
-from pbdkit.io.layout import in_this_layout, json_attribute, reserved_names
+from pbdkit.io.layout import (
+    in_this_layout,
+    indices_of,
+    json_attribute,
+    refuse_unknown_matching,
+    reserved_names,
+)
 from pbdkit.io.members import STATUS
 from pbdkit.memory import machine_memory
 from pbdkit.sweeps.specification import MESSAGE, Dimension, Member, names_of, values_along
@@ -21,7 +27,12 @@ if TYPE_CHECKING:
     import xarray
 
 
-def concat(runs: Iterable[xarray.Dataset], dim: str = "run") -> xarray.Dataset:
+def concat(
+    runs: Iterable[xarray.Dataset],
+    dim: str = "run",
+    *,
+    by: Literal["number", "site"] = "number",
+) -> xarray.Dataset:
     """Combine datasets of single runs along a new dimension.
 
     Parameters
@@ -30,6 +41,10 @@ def concat(runs: Iterable[xarray.Dataset], dim: str = "run") -> xarray.Dataset:
         Results of single runs.
     dim : str
         Name of the new dimension.
+    by : {"number", "site"}
+        Align particles by number, or by site indices (i, j), for bodies of different shape. With
+        "site" the dataset contains every site of any run, counted by `particle`; `number` is that
+        in each run, and variables of bonds are omitted, because bonds are numbered by particles.
 
     Returns
     -------
@@ -44,8 +59,8 @@ def concat(runs: Iterable[xarray.Dataset], dim: str = "run") -> xarray.Dataset:
     Raises
     ------
     ExperimentError
-        If there are no runs, if a dataset has no experiment, or if `dim` is the name of a variable
-        or a dimension of a dataset.
+        If there are no runs, if a dataset has no experiment or, with "site", no site indices, or
+        if `dim` is the name of a variable or a dimension of a dataset.
 
     Examples
     --------
@@ -67,8 +82,13 @@ def concat(runs: Iterable[xarray.Dataset], dim: str = "run") -> xarray.Dataset:
         raise ExperimentError(f"{fault}: only results of pbdkit can be combined")
     if any(dim in run.variables or dim in run.dims for run in datasets):
         raise ExperimentError(f"the runs have a variable or dimension '{dim}'; choose another name")
+    refuse_unknown_matching(by)
+    if by == "site":
+        datasets = [_by_site(run) for run in datasets]
     options: dict[str, Any] = {"data_vars": "all", "coords": "different", "compat": "equals"}
     combined = xarray.concat(datasets, dim, join="outer", combine_attrs="drop_conflicts", **options)
+    if by == "site":
+        combined = _numbered(_shared(combined, dim, datasets[0]))
     parameters = dict(_differences(experiments))
     attributes = {
         name: [str(run.attrs.get(name, "")) for run in datasets] for name in _attributes(datasets)
@@ -85,6 +105,32 @@ def concat(runs: Iterable[xarray.Dataset], dim: str = "run") -> xarray.Dataset:
     for path, values in parameters.items():
         coordinates[names[path]] = (dim, values_along(_numbers(values)), {"long_name": path})
     return combined.assign_coords(coordinates)
+
+
+def _by_site(run: xarray.Dataset) -> xarray.Dataset:
+    """Return a dataset without bonds, with particles indexed by their sites."""
+    if len(indices_of(run)) < 2:
+        raise ExperimentError("the particles of a dataset have no site indices i and j")
+    plain = run.drop_dims(["bond", "crack"], errors="ignore").drop_vars("particle")
+    return plain.set_index(particle=["i", "j"])
+
+
+def _shared(combined: xarray.Dataset, dim: str, run: xarray.Dataset) -> xarray.Dataset:
+    """Store coordinates of particles once if they are equal in all runs that have the particle."""
+    shared = {}
+    for name, variable in combined.coords.items():
+        if {dim, "particle"} <= {*variable.dims} and variable.dtype.kind == "f":
+            least, largest = variable.min(dim), variable.max(dim)
+            if (least == largest).all():
+                shared[name] = largest.variable.astype(run[name].dtype)
+                shared[name].attrs = run[name].attrs
+    return combined.assign_coords(shared)
+
+
+def _numbered(combined: xarray.Dataset) -> xarray.Dataset:
+    """Replace the index of sites by the number of the particle."""
+    numbers = np.arange(1, combined.sizes["particle"] + 1)
+    return combined.reset_index("particle").assign_coords(particle=numbers)
 
 
 def _differences(parts: list[Any], path: tuple[str, ...] = ()) -> Iterator[tuple[str, list[Any]]]:

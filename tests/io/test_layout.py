@@ -2,6 +2,7 @@
 
 import gzip
 import json
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +11,10 @@ import xarray
 from property_cases import LATTICES, experiment, pull_right
 
 import pbdkit
-from pbdkit.io.layout import OF_BODY, OF_FRAME
+from pbdkit.io.layout import OF_BODY, OF_FRAME, site_keys
 from pbdkit.io.netcdf import NetcdfSink
 from pbdkit.lattice.raster import FRAME
+from pbdkit.plotting.configuration import difference_of
 from pbdkit.progress import Watch
 from pbdkit.scene.scene import build_scene
 from pbdkit.simulation import Simulation, record
@@ -235,6 +237,69 @@ def test_unfinished_run_has_the_same_layout(tmp_path, monkeypatch):
             n: (v.dims, v.dtype, repr(v.attrs)) for n, v in whole.variables.items()
         }
         assert {*left.coords} == {*whole.coords}
+
+
+def test_fields_are_plotted_over_the_components_of_the_reference(sheet):
+    np.testing.assert_array_equal(np.stack([sheet.X, sheet.Y], axis=1), sheet.reference)
+    assert sheet.X.attrs["units"] == sheet.reference.attrs["units"]
+    last = sheet.isel(time=-1)
+    dots = last.plot.scatter(x="X", y="Y", hue="pe1")
+    np.testing.assert_array_equal(dots.get_offsets(), sheet.reference)
+    np.testing.assert_array_equal(np.ma.filled(dots.get_array(), np.nan), last.pe1)
+
+
+def test_tables_contain_the_variables_of_one_kind_of_objects(sheet):
+    table = sheet.pbd.to_dataframe()
+    assert len(table) == sheet.sizes["time"] * sheet.sizes["particle"]
+    assert not {"number", "broken_step", "reference_x"} & {*table.columns}
+    row = table.loc[(10, 20)]
+    at = sheet.sel(time=10, particle=20)
+    assert row[["X", "Y"]].tolist() == at.reference.values.tolist()
+    assert row[["position_x", "position_y"]].tolist() == at.position.values.tolist()
+    np.testing.assert_equal(row.pe1, at.pe1.item())
+    bonds = sheet.pbd.to_dataframe("bond")
+    assert bonds.broken_step.tolist() == sheet.broken_step.values.tolist()
+    assert {"crack_step", "crack_midpoint_x"} <= {*sheet.pbd.to_dataframe("crack").columns}
+    with pytest.raises(pbdkit.ExperimentError, match="no variable has only the dimension 'load'"):
+        sheet.pbd.to_dataframe("load")
+
+
+def of_rows(rows):
+    body = {"type": "grid", "columns": 4, "rows": rows}
+    return torn(body=body, diagnostics=[{"type": "pe1"}, {"type": "displacement"}])
+
+
+def test_runs_of_different_bodies_are_joined_by_sites():
+    runs = [of_rows(5), of_rows(7)]
+    joined = pbdkit.concat(runs, by="site")
+    assert not {"bond", "crack"} & {*joined.dims}
+    for n, run in enumerate(runs):
+        ours = joined.isel(run=n)
+        ours = ours.isel(particle=np.flatnonzero(ours.number.notnull()))
+        rows = ours.number.values.astype(int) - 1
+        assert sorted(rows) == [*range(run.sizes["particle"])]
+        np.testing.assert_array_equal(ours.u, run.u.isel(particle=rows))
+        for name in ("i", "j", "X", "Y"):
+            np.testing.assert_array_equal(ours[name], run[name][rows])
+    assert joined.X.dims == ("particle",)
+    assert joined.reference.attrs == runs[0].reference.attrs
+    with pytest.raises(pbdkit.ExperimentError, match="expected 'number' or 'site', got 'name'"):
+        pbdkit.concat(runs, by="name")
+
+
+def test_difference_of_different_bodies_is_by_sites():
+    small, large = of_rows(5), of_rows(7)
+    with pytest.warns(pbdkit.errors.SceneWarning, match=r"is at \(.*\) in the first run and at"):
+        difference_of(small, large, "u_x", None)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        difference_of(small, small, "u_x", None)
+        changed, _ = difference_of(small, large, "u_x", None, "site")
+    assert len(changed.particle) == len({*site_keys(small)} & {*site_keys(large)})
+    for i, j in ((0, 0), (2, 3)):
+        one, two, both = (d.pbd.at(i=i, j=j) for d in (small, large, changed))
+        difference = two.u.isel(time=-1) - one.u.isel(time=-1)
+        np.testing.assert_array_equal(both.difference, difference)
 
 
 @pytest.fixture

@@ -113,7 +113,13 @@ def test_lattice_values_equal_those_without_units_bit_for_bit(bar: Any) -> None:
     given = dict(zip(("stress", "reaction", "strain-energy"), (*moduli, moduli[1]), strict=True))
     plain["diagnostics"] = [d | given.get(d["type"], {}) for d in plain["diagnostics"]]
     other = run(plain)
-    assert {*bar.variables} - {*other.variables} == {"reference_mm", "u_mm", "track_mm"}
+    assert {*bar.variables} - {*other.variables} == {
+        "reference_mm",
+        "X_mm",
+        "Y_mm",
+        "u_mm",
+        "track_mm",
+    }
     for name in {*other.variables} - {"reaction", "strain_energy"}:
         np.testing.assert_array_equal(bar[name], other[name])
     np.testing.assert_array_equal(bar.reaction, 0.25 * other.reaction)
@@ -139,7 +145,18 @@ def test_accessor_converts_all_variables_with_a_scale(bar: Any) -> None:
     np.testing.assert_array_equal(physical.u, bar.u_mm)
     np.testing.assert_array_equal(physical.reaction, bar.reaction)
     assert "u_mm" not in physical
-    assert {*physical.coords} == {*bar.coords} - {"reference_mm"}
+    assert {*physical.coords} == {*bar.coords} - {"reference_mm", "X_mm", "Y_mm"}
+
+
+def test_units_of_a_converted_dataset_are_known_to_pint(bar: Any) -> None:
+    pint = pytest.importorskip("pint", reason="pint is not installed")
+    physical, registry = bar.pbd.physical(), pint.UnitRegistry()
+    units = {v.attrs["units"] for v in physical.variables.values() if "units" in v.attrs}
+    assert {"mm", "mm^2", "MPa", "N", "mJ", "1"} <= units
+    for unit in units:
+        registry.parse_units(unit)
+    assert physical.time.attrs["lattice_units"] == "step"
+    assert not bar.attrs["Conventions"].startswith("CF")  # "lattice unit" is no unit of UDUNITS.
 
 
 def test_dataset_reruns_and_records_in_single_precision(bar: Any) -> None:
