@@ -212,7 +212,7 @@ class PbdAccessor:
         pandas.DataFrame
             Table with a row for each object and, if a variable depends on time, each recorded time;
             both are in the index. The columns are the variables that have no further dimension,
-            the components of vectors and principal values, and coordinates of the objects.
+            the components of vectors, and coordinates of the objects.
             Quantities of other objects are omitted. The size is that of these variables, unlike
             that of ``ds.to_dataframe()``, which combines all dimensions.
 
