@@ -235,7 +235,7 @@ def put(key: str, data: bytes) -> None:
 
 
 def test_piece_that_was_deleted_can_be_stored_again(tmp_path: Path) -> None:
-    """As a batch of equal values, which is committed, written to the file, and filled again."""
+    """Batches of equal values are committed, written to the file, and filled again."""
     piece = ("array/waiting.broken/0", b"zeros")
     with RunStore(tmp_path / "out.nc.run", mode="rwc") as store:
         store.commit([piece])
