@@ -125,3 +125,28 @@ def test_a_guided_particle_moves_to_the_nearest_free_place_on_its_line(axis: int
             assert abs(abs(w[1 - axis]) - nearest) <= FINENESS
             moved += w.any()
     assert moved > 20
+
+
+def test_places_in_a_ring_move_to_the_nearer_circle() -> None:
+    ring = outline_of(
+        Obstacle(shape={"type": "ring", "inner": 1.0, "outer": 2.5, "centre": [0.5, 0.3]}).shape
+    )
+    at = places(200)
+    r = np.hypot(*(at.T - (0.5, 0.3)).T)
+    at, r = at[:, (r > 1.0) & (r < 2.5)], r[(r > 1.0) & (r < 2.5)]
+    w = ring.outline_correction(at, np.repeat([[1.0], [0.0], [1.0]], len(r), axis=1))
+    depth = np.minimum(r - 1.0, 2.5 - r)
+    np.testing.assert_allclose(np.hypot(*w), depth, atol=1e-9)
+    np.testing.assert_allclose(ring.facing(*at)[0], -depth, atol=1e-12)
+    np.testing.assert_allclose(ring.facing(*(at + w))[0], 0.0, atol=1e-9)
+    on_outer = 2.5 - r < r - 1.0
+    assert 20 < on_outer.sum() < len(r) - 20
+
+
+def test_vertices_of_polygons_are_distinct_and_counterclockwise() -> None:
+    square = [[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]]
+    for vertices in (square, square[:2] + square[1:], [*square, square[0]], square[::-1]):
+        points = outline_of(Obstacle(shape={"type": "polygon", "vertices": vertices}).shape).points
+        assert sorted(map(tuple, points)) == sorted(map(tuple, square))
+        x, y = points.T
+        assert (x * np.roll(y, -1) - np.roll(x, -1) * y).sum() == 8.0
