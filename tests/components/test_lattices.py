@@ -5,7 +5,11 @@ from itertools import product
 import numpy as np
 import pytest
 
+from pbdkit.components.frames import NoFrame
 from pbdkit.components.lattices import CentredRectangular, Hexagonal, Oblique, Rectangular, Square
+from pbdkit.components.neighbours import Chebyshev, Coordination, Euclidean
+from pbdkit.lattice.cells import tiling_of
+from pbdkit.lattice.neighbourhood import build_neighbourhood
 
 LATTICES = [
     Square(a=1.3),
@@ -47,3 +51,42 @@ def test_site_indices_number_the_lines_of_sites(lattice):
     ]
     spacing = cell.vectors[1].y / cell.period[1]
     np.testing.assert_allclose([y for _, y in height], [j * spacing for j, _ in height], atol=1e-12)
+
+
+@pytest.mark.parametrize("lattice", LATTICES, ids=lambda lattice: lattice.type)
+@pytest.mark.parametrize("weights", [(1.0, 1.0), (1.0, 1.7), (2.2, 0.6)])
+def test_weighted_neighbours_are_the_sites_within_the_radius(lattice, weights):
+    """√(w_x x² + w_y y²) is at most the radius, and equal in a shell."""
+    cell, radius = lattice.cell(), 2.9
+    sites = range(len(cell.sites))
+    shells = Euclidean(radius=radius, weights=weights).shells_around(cell, 0)
+
+    def distance(rest):
+        return np.sqrt(weights[0] * rest[0] ** 2 + weights[1] * rest[1] ** 2)
+
+    every = [
+        offset
+        for target, step in product(sites, product(range(-9, 10), repeat=2))
+        for offset in [cell.offset(0, target, step)]
+    ]
+    expected = {o for o in every if 0.0 < distance(o.rest) <= radius}
+    assert {offset for shell in shells for offset in shell} == expected
+    means = [np.mean([distance(o.rest) for o in shell]) for shell in shells]
+    assert means == sorted(means)
+    for shell, mean in zip(shells, means, strict=True):
+        np.testing.assert_allclose([distance(o.rest) for o in shell], mean, rtol=1e-6)
+
+
+@pytest.mark.parametrize("lattice", LATTICES, ids=lambda lattice: lattice.type)
+def test_cells_of_regular_lattices_are_regular(lattice):
+    neighbours = Coordination() if lattice.type == "hexagonal" else Chebyshev()
+    cell = lattice.cell()
+    polygons = tiling_of(cell, build_neighbourhood(cell, neighbours).slots).polygons
+    assert polygons
+    for polygon in polygons:
+        assert polygon.is_regular == (lattice.type in ("square", "hexagonal"))
+
+
+def test_no_frame_has_no_frame_points():
+    follow = NoFrame().follow(None)
+    assert len(follow.point) == len(follow.body) == len(follow.weight) == 0
