@@ -12,9 +12,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from crossed_scenes import experiment_from, numbered, numbers_in, places_of
 from numpy.typing import NDArray
-
-import pbdkit
 
 Floats = NDArray[np.float64]
 Tree = dict[str, Any]
@@ -72,9 +71,18 @@ def applies_to(change: Change, experiment: Tree) -> bool:
         return True
     if "scatter" in experiment.get("fracture", {}):
         return False  # strengths are drawn in the order of the bonds
-    if experiment["lattice"]["type"] != "hexagonal":
+    if experiment.get("initial", {}).get("type") == "noise":
+        return False  # displacements are drawn in the order of the particles
+    if any(one["type"] == "wind" for one in experiment.get("operations", ())):
+        return False  # it blows along x
+    kind, body = experiment["lattice"]["type"], experiment["body"]
+    bodies = [body, *experiment.get("regions", {}).values()]
+    if kind in ("oblique", "centred-rectangular"):
+        return False
+    if change.swaps and any(one["type"] == "dogbone" for one in bodies):
+        return False  # it extends along x
+    if kind != "hexagonal":
         return True
-    body = experiment["body"]
     odd = body["type"] != "grid" or body["rows"] % 2 == 1
     return change.axes == AXES["mirrored in y"] and odd
 
@@ -90,7 +98,12 @@ class _Changed:
 
     def experiment(self) -> Tree:
         given, change = self.given, self.change
-        fields = pbdkit.Experiment(**given).rule.in_place_of_numbers()
+        validated = experiment_from(given)
+        fields = validated.rule.in_place_of_numbers()
+        if numbers_in(given):
+            places = places_of(given)
+            for holder in numbers_in(given):
+                holder["numbers"] = [places[number] for number in holder["numbers"]]
         found = given | {
             "lattice": self.lattice(),
             "body": self.body(given["body"]),
@@ -108,8 +121,41 @@ class _Changed:
         if "regions" in given:
             found["regions"] = {n: self.body(one) for n, one in given["regions"].items()}
         if "fracture" in given:
-            found["fracture"] = self.fracture(given["fracture"])
+            fields = validated.fracture.in_place_of_numbers()
+            found["fracture"] = self.fracture(given["fracture"], fields)
+        if given.get("initial", {}).get("type", "reference") != "reference":
+            found["initial"] = self.initial(given["initial"])
+        found["diagnostics"] = [self.diagnostic(one) for one in given["diagnostics"]]
+        if "operations" in given:
+            found["operations"] = [self.operation(one) for one in given["operations"]]
+        return numbered(found)
+
+    def initial(self, initial: Tree) -> Tree:
+        change, found = self.change, dict(initial)
+        if "amplitude" in initial:
+            found["amplitude"] = change.factor * initial["amplitude"]
+        if "gradient" in initial:
+            M = change.matrix
+            gradient = M @ np.array(initial["gradient"]) @ M.T
+            shift = change.vector(initial.get("shift", (0.0, 0.0))) - gradient @ change.shift
+            found |= {"gradient": gradient.tolist(), "shift": shift.tolist()}
         return found
+
+    def diagnostic(self, diagnostic: Tree) -> Tree:
+        change, found = self.change, dict(diagnostic)
+        if diagnostic["type"] == "stress-strain":
+            found["width"] = change.factor * diagnostic["width"]
+            found["axis"] = change.axis(diagnostic.get("axis", "x"))
+        if "numbers" in diagnostic:
+            found["numbers"] = [change.place(x) for x in diagnostic["numbers"]]
+        if "points" in diagnostic:
+            found["points"] = [change.place(x) for x in diagnostic["points"]]
+        return found
+
+    def operation(self, operation: Tree) -> Tree:
+        if operation["type"] != "wind":
+            return operation
+        return operation | {"speed": self.change.factor * operation["speed"]}
 
     def lattice(self) -> Tree:
         lattice, change = self.given["lattice"], self.change
@@ -148,17 +194,29 @@ class _Changed:
             return body | sizes | {"origin": low.tolist()}
         if body["type"] in ("union", "difference", "intersection"):
             return body | {"of": [self.body(one) for one in body["of"]]}
-        if body["type"] == "disc":
-            return body | {
-                "radius": change.factor * body["radius"],
-                "centre": change.place(body["centre"]),
-            }
+        if body["type"] in ("disc", "ring"):
+            radii = {n: change.factor * body[n] for n in ("radius", "inner", "outer") if n in body}
+            return body | radii | {"centre": change.place(body["centre"])}
+        if body["type"] == "polygon":
+            return body | {"vertices": [change.place(x) for x in body["vertices"]]}
+        if body["type"] == "dogbone":
+            low = np.array(body["origin"])
+            ends = [
+                change.place(low),
+                change.place(low + np.array([body["length"], body["width"]])),
+            ]
+            names = ("length", "width", "gauge_length", "gauge_width", "radius")
+            sizes = {n: change.factor * body[n] for n in names}
+            return body | sizes | {"origin": np.min(ends, axis=0).tolist()}
         raise NotImplementedError(body["type"])
 
     def neighbours(self, near: Tree) -> Tree:
         if near["type"] != "euclidean":
             return near
-        return near | {"radius": self.change.factor * near["radius"]}
+        found = near | {"radius": self.change.factor * near["radius"]}
+        if "weights" in near and self.change.swaps:
+            found["weights"] = near["weights"][::-1]
+        return found
 
     def rule(self, rule: Tree, fields: Tree) -> Tree:
         change, found = self.change, dict(rule)
@@ -167,8 +225,8 @@ class _Changed:
         if "length" in rule:
             found["length"] = change.factor * rule["length"]
         if rule["type"] == "mixed-coordinate":
-            sign = -1.0 if change.reverses(rule["axis"]) else 1.0
-            found["axis"] = change.axis(rule["axis"])
+            sign = -1.0 if change.reverses(rule.get("axis", "x")) else 1.0
+            found["axis"] = change.axis(rule.get("axis", "x"))
             found["K"] = scaled(found["K"], sign / change.factor)
         if rule["type"] == "orthotropic" and change.swaps:
             ratio = rule["modulus_ratio"]
@@ -182,11 +240,12 @@ class _Changed:
         """Return the replacement of a number; random fields are as they were drawn, unless lengths
         alone change."""
         change = self.change
-        if "correlation_length" not in asked:
+        is_drawn = "correlation_length" in asked
+        if not is_drawn and {*asked} != {"x", "y", "values"}:
             return asked
-        if change.axes == KEEP and change.shift == (0.0, 0.0):
+        if is_drawn and change.axes == KEEP and change.shift == (0.0, 0.0):
             return asked | {"correlation_length": change.factor * asked["correlation_length"]}
-        drawn = value["drawn"]
+        drawn = value["drawn"] if is_drawn else value
         values, sides = np.array(drawn["values"], float), [drawn["x"], drawn["y"]]
         table = values  # (x, y)
         if change.swaps:
@@ -200,12 +259,14 @@ class _Changed:
             places.append(place.tolist())
         return {"x": places[0], "y": places[1], "values": table.tolist()}
 
-    def fracture(self, fracture: Tree) -> Tree:
+    def fracture(self, fracture: Tree, fields: Tree) -> Tree:
         change, found = self.change, dict(fracture)
+        for name, value in fields.items():
+            found[name] = self.field(fracture[name], value)
         if "thresholds" in fracture:
             found["thresholds"] = [scaled(one, change.factor) for one in fracture["thresholds"]]
         if "energy" in fracture:
-            found["energy"] = scaled(fracture["energy"], change.factor)
+            found["energy"] = scaled(found["energy"], change.factor)
         if "cracks" in fracture:
             found["cracks"] = [[change.place(x) for x in crack] for crack in fracture["cracks"]]
         return found
@@ -244,13 +305,17 @@ class _Changed:
             return {"box": [*mapped.min(axis=0).tolist(), *mapped.max(axis=0).tolist()]}
         if "nearest" in select:
             return {"nearest": [change.place(x) for x in select["nearest"]]}
+        if "numbers" in select:
+            return {"numbers": [change.place(x) for x in select["numbers"]]}
         return select
 
     def motion(self, motion: Tree) -> Tree:
         change, found = self.change, dict(motion)
-        for name in ("displacement", "velocity", "amplitude", "force"):
+        for name in ("displacement", "velocity", "amplitude"):
             if name in motion:
                 found[name] = change.rotated(motion[name])
+        if "force" in motion:
+            found["force"] = self.force(motion["force"], change.factor)
         if "displacements" in motion:
             found["displacements"] = [change.rotated(v) for v in motion["displacements"]]
         if "points" in motion:
@@ -263,11 +328,16 @@ class _Changed:
     def load(self, load: Tree) -> Tree:
         found = load | {"select": self.select(load["select"])}
         if "force" in load:
-            found["force"] = self.change.rotated(load["force"])
+            found["force"] = self.force(load["force"], self.change.factor)
         if "body_force" in load:
-            force = np.array(self.change.turned(load["body_force"]))
-            found["body_force"] = (force / self.change.factor).tolist()
+            found["body_force"] = self.force(load["body_force"], 1.0 / self.change.factor)
         return found
+
+    def force(self, force: Any, factor: float) -> list[Any]:
+        """Return factor · M f, of which components can depend on time."""
+        sources = [int(np.flatnonzero(row)[0]) for row in self.change.matrix]
+        signs = self.change.matrix.sum(axis=1).tolist()
+        return [scaled(force[k], sign * factor) for k, sign in zip(sources, signs, strict=True)]
 
 
 def scaled(number: Any, factor: float) -> Any:
@@ -282,18 +352,32 @@ def scaled(number: Any, factor: float) -> Any:
 
 POWERS = {
     "u": 1,
+    "track": 1,
     "reaction": 1,
     "contact_force": 1,
     "contact": 1,
     "load_resultant": 1,
     "load_displacement": 1,
     "strain_energy": 2,
+    "pe1": 2,
+    "pe1_intact": 2,
+    "pe2": 1,
+    "rotation": 0,
+    "broken_bonds": 0,
+    "smallest_cell_area": 0,
+    "nominal_stress": 0,
+    "nominal_strain": 0,
+    "crack_step": 0,
+    "crack_strain": 0,
 }
-"""The compared quantities: vectors that turn with the axes, the energy, and their powers of
-length."""
+"""The compared quantities, and their powers of length. Vectors turn with the axes."""
+TENSORS = ("strain", "green_lagrange", "stress", "piola_kirchhoff")
+"""Tensors in the plane, with variables for components and invariants."""
+PARTS = ("xx", "yy", "xy", "von_mises", "principal")
+"""Components and invariants of tensors, which are variables."""
 
 
-SMALL = {1: 1e-2, 2: 1e-4}
+SMALL = {0: 1e-2, 1: 1e-2, 2: 1e-4}
 """Below these, times their powers of the factor, values are those of a body at rest: leaders go
 some hundredths of a spacing."""
 
@@ -305,22 +389,50 @@ def differences(first: Any, second: Any, change: Change) -> dict[str, float]:
     if found["steps"]:
         return found
     order = _images(first, second, change)
-    for name in sorted(POWERS.keys() & set(first.data_vars)):
-        one, other = (ds[name].values.astype(float) for ds in (first, second))
+    for name in sorted({*first.data_vars} & {*second.data_vars}):
+        source, sign, power = _counterpart(str(name), change)
+        if power is None:
+            continue
+        one, other = first[source].values.astype(float), second[name].values.astype(float)
+        one, other = (_comparable(name, ds, v) for ds, v in ((first, one), (second, other)))
+        if one.shape != other.shape:
+            found[str(name)] = float("inf")
+            continue
         if "particle" in first[name].dims:
             other = other[:, order]
         if "axis" in first[name].dims:
             one = one @ change.matrix.T
-        power = POWERS[name]
         least = SMALL[power] * change.factor**power
-        expected = one * change.factor**power
+        expected = sign * one * change.factor**power
         size = max(np.nanmax(np.abs(expected), initial=0.0), least)
-        found[name] = float(np.nanmax(np.abs(other - expected), initial=0.0) / size)
-        found[name] += float((np.isnan(other) != np.isnan(expected)).sum())
+        found[str(name)] = float(np.nanmax(np.abs(other - expected), initial=0.0) / size)
+        found[str(name)] += float((np.isnan(other) != np.isnan(expected)).sum())
     if "broken_step" in first:
         one, other = _broken(first, np.arange(len(order))), _broken(second, np.argsort(order))
         found["broken bonds"] = float(len(one ^ other))
     return found
+
+
+def _counterpart(name: str, change: Change) -> tuple[str, float, int | None]:
+    """Return the variable of the first dataset that corresponds to one of the second, its sign, and
+    the power of length; None if it is not compared."""
+    tensor = next((t for t in TENSORS if name.removeprefix(f"{t}_") in PARTS), None)
+    turns = float(round(np.linalg.det(change.matrix)))
+    if tensor:
+        part = name.removeprefix(f"{tensor}_")
+        if change.swaps and part in ("xx", "yy"):
+            part = {"xx": "yy", "yy": "xx"}[part]
+        # M = [[a, 0], [0, b]] or [[0, a], [b, 0]] multiplies xy by a b.
+        sign = float(change.matrix.sum(axis=1).prod()) if part == "xy" else 1.0
+        return f"{tensor}_{part}", sign, 0
+    return name, turns if name == "rotation" else 1.0, POWERS.get(name)
+
+
+def _comparable(name: Any, dataset: Any, values: Floats) -> Floats:
+    """Return values that do not depend on the place of the body or the order of bonds."""
+    if name == "track":
+        return values - values[:1]
+    return np.sort(values) if str(name).startswith("crack_") else values
 
 
 def _images(first: Any, second: Any, change: Change) -> NDArray[np.intp]:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from changed_axes import AXES, KEEP, Change, applies_to, changed, differences
+from crossed_scenes import experiment_from
 from interpreted_kernels import interpreting
 
 import pbdkit
@@ -40,7 +41,14 @@ def run(experiment: Tree) -> Any:
     """The dataset, without warnings: scenes here are small, torn and pressed."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", pbdkit.PbdkitWarning)
-        return pbdkit.run(experiment, progress=False)
+        return _run(experiment)
+
+
+def _run(experiment: Tree) -> Any:
+    if experiment["solver"].get("engine") != "compiled":
+        return pbdkit.run(experiment_from(experiment), progress=False)
+    with interpreting():
+        return pbdkit.run(experiment_from(experiment), progress=False)
 
 
 @lru_cache(maxsize=4)
@@ -56,6 +64,8 @@ def known(experiment: Tree) -> Any:
 def tolerance(experiment: Tree, *, exact: bool = False) -> float:
     """Return the tolerance between results of the same scene in another description."""
     solver = experiment["solver"]
+    if experiment.get("record", {}).get("dtype") == "float32":
+        return SINGLE
     if solver["type"] == "equilibrium":
         return FOUND
     if exact and not _is_rounded(experiment):
@@ -75,7 +85,7 @@ def keeps_answers(experiment: Tree, change: Change, what: str, *, exact: bool = 
     if not applies_to(change, experiment):
         return []
     given = experiment
-    if change.axes != KEEP and experiment["solver"].get("memory") == "auto":
+    if change.axes != KEEP and "auto" in experiment["solver"].values():
         given = with_chosen_weights(experiment)  # they are chosen to some digits
     found = differences(known(given), run(changed(given, change)), change)
     most = tolerance(experiment, exact=exact)
@@ -119,12 +129,11 @@ def of_engines(experiment: Tree, n: int = 0) -> Faults:
     faults = _different(once, plain, "a second run")
     if solver.get("precision") == "float32":
         return faults  # kernels keep constants in double precision
-    with interpreting():
-        try:
-            compiled = run(experiment | {"solver": solver | {"engine": "compiled", "threads": 1}})
-        except pbdkit.ExperimentError as error:
-            refused = "the compiled engine is not available" in str(error)
-            return faults if refused else [*faults, str(error)]
+    try:
+        compiled = run(experiment | {"solver": solver | {"engine": "compiled"}})
+    except pbdkit.ExperimentError as error:
+        refused = "the compiled engine is not available" in str(error)
+        return faults if refused else [*faults, str(error)]
     return faults + _different(plain, compiled, "the compiled engine")
 
 
@@ -140,10 +149,11 @@ def of_stopping(experiment: Tree, n: int) -> Faults:
     if experiment["solver"]["type"] != "stepping":
         return []
     step = 1 + n % (experiment["steps"] - 3)
-    scene, again = (build_scene(pbdkit.Experiment(**experiment)) for _ in range(2))
-    found = laws.resumed(scene, again, step)
+    scene, again = (build_scene(experiment_from(experiment)) for _ in range(2))
+    with interpreting():
+        found = laws.resumed(scene, again, step)
     names = [n for n, v in known(experiment).variables.items() if not v.equals(found[n].variable)]
-    return [f"gone on with after step {step}: other {', '.join(map(str, names))}"] if names else []
+    return [f"continued after step {step}: other {', '.join(map(str, names))}"] if names else []
 
 
 def of_balance(experiment: Tree, n: int = 0) -> Faults:
@@ -152,6 +162,7 @@ def of_balance(experiment: Tree, n: int = 0) -> Faults:
     rests = experiment["solver"]["type"] == "equilibrium"
     if not (rests and has_laws_of_mechanics(experiment)):
         return []
+    experiment = with_forces(experiment)
     ds = known(experiment)
     forces = [ds["reaction"].values[-1]]
     for name in ("load_resultant", "contact_force"):
@@ -165,6 +176,18 @@ def of_balance(experiment: Tree, n: int = 0) -> Faults:
     if not (experiment.get("obstacles") or _is_torn(experiment) or experiment.get("cuts")):
         faults += _of_energy(experiment, ds)
     return faults
+
+
+def with_forces(experiment: Tree) -> Tree:
+    """Return the experiment with all forces and the energy among its diagnostics."""
+    parts = {"reaction": "leaders", "load-displacement": "loads", "contact": "obstacles"}
+    kinds = ["strain-energy", *(kind for kind, part in parts.items() if experiment.get(part))]
+    others = [one for one in experiment["diagnostics"] if one["type"] not in kinds]
+    units = experiment.get("units", {})
+    values = {} if "youngs_modulus" in units else {"youngs_modulus": 1.0}
+    values |= {"thickness": 1.0} if units and "thickness" not in units else {}
+    added = [{"type": kind} | values for kind in kinds]
+    return experiment | {"diagnostics": [*others, *added], "record": {}}
 
 
 def _of_energy(experiment: Tree, ds: Any) -> Faults:
@@ -193,7 +216,7 @@ def work_of(scene: Scene, moment: StateMoment) -> float:
 
 def last_moment(experiment: Tree) -> tuple[Scene, StateMoment]:
     """The scene, and where its run ends."""
-    course = Simulation.of_scene(build_scene(pbdkit.Experiment(**experiment)))
+    course = Simulation.of_scene(build_scene(experiment_from(experiment)))
     for _ in course:
         pass
     return course.scene, StateMoment(course.driver.state.copy(), Tables(course.scene))
@@ -201,11 +224,15 @@ def last_moment(experiment: Tree) -> tuple[Scene, StateMoment]:
 
 def _modulus(experiment: Tree) -> float:
     """Return the factor of forces in a dataset, over Young's modulus and thickness."""
-    return 200.0 * 2.0 if "units" in experiment else 1.0
+    units = experiment.get("units", {})
+    modulus, thickness = (
+        float(units.get(n, "1 ").split()[0]) for n in ("youngs_modulus", "thickness")
+    )
+    return modulus * thickness
 
 
 def _is_torn(experiment: Tree) -> bool:
-    return "fracture" in experiment
+    return experiment.get("fracture", {}).get("type", "none") != "none"
 
 
 def has_laws_of_mechanics(experiment: Tree) -> bool:
@@ -219,8 +246,9 @@ def of_stiffness(experiment: Tree, n: int) -> Faults:
     back, and bonds that break or soften stiffen nothing: whole, and with bonds torn at random."""
     if not has_laws_of_mechanics(experiment):
         return []
-    experiment = experiment | {"solver": {"type": "stepping", "relaxation": 0.5}}
-    scene = build_scene(pbdkit.Experiment(**experiment))
+    stepping = {"type": "stepping", "relaxation": 0.5}
+    experiment = experiment | {"solver": stepping, "record": {}}
+    scene = build_scene(experiment_from(experiment))
     # A central difference of springs has some nine digits.
     most = 1e-9 if isinstance(scene.experiment.rule, StoresEnergy) else 1e-12
     whole = laws.whole_state(scene)
