@@ -255,7 +255,10 @@ def test_a_decayed_field_opens_at_the_range_of_its_step(page, sheet):
 
 
 def short(value):
-    return f"{value:.4g}" if value >= 1e-3 else f"{value:.3e}".replace("e-0", "e-")
+    """The text of a positive number on the page."""
+    if value >= 1e-3:
+        return f"{value:.4g}"
+    return re.sub(r"(\.?0+)?e-0?", "e-", f"{value:.3e}")
 
 
 def test_predicted_and_measured_spectral_radius(page, sheet):
