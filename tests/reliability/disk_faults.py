@@ -1,80 +1,79 @@
-"""Inject faults of a disk at each call by which a command writes: an error, a short write, a full
-disk.
+"""Inject a fault at each call by which a command reads or writes its files, or allocates memory.
 
-    python tests/reliability/disk_faults.py [--commands run,export] [--kinds EIO,short,full]
-                                            [--every N] [--first N]
+    python tests/reliability/disk_faults.py [--command run,export] [--kind eio,kill] [--every N]
+                                            [--first N] [--least BYTES] [--messages]
 
-A library of 200 lines of C is compiled and preloaded. The n-th call of a command on files below its
-folder (write, pwrite, fsync, fdatasync, link, rename, unlink, ftruncate, mkdir, mmap, open with
-O_CREAT) fails with EIO, writes half of its bytes, or, with all that need room after it, reports
-ENOSPC. Each trial is a fork of one process that has imported everything. Checked are the exit
-status, the message, the earlier file, the files in the folder, that an output of exit 0 is that of
-the undisturbed command, and that the next call produces it if the exit was 6.
+A library of C (faults.c) is compiled and preloaded. Counted are the calls of a command on files
+below its folder: write, pwrite, fsync, fdatasync, link, rename, unlink, ftruncate, mkdir, rmdir,
+mmap and open. The calls of SQLite within a commit are among them. The kinds of faults are
+
+    eio       the n-th call fails with EIO
+    enospc    the n-th call and all later ones that need room fail with ENOSPC
+    short     the n-th call writes half of its bytes, as POSIX allows
+    kill      SIGKILL before the n-th call
+    power     a power cut before the n-th call; contents and names that were not synced are lost
+    torn      the same, but names and a random part of the contents are on the disk
+    memory    the n-th allocation of 64 KiB or more, and all later ones, return NULL
+    block     the n-th allocation of 64 KiB or more returns NULL, later ones succeed
+
+Each trial is a fork of one process that has imported everything. Power cuts are derived from one
+recorded execution. A trial holds if the exit status is documented, one message names the place, the
+earlier output is unchanged unless the new one is complete, no other file remains, and the same
+command (`resume` for an unfinished run) then comes to the output of the undisturbed command, bit
+for bit. A crash in a library that has no memory is listed with the name of the library; all other
+conditions apply to it too. The exit status is 1 if a trial did not hold.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
-import ctypes
+import gc
+import hashlib
 import json
 import os
+import random
 import re
+import secrets
 import shutil
-import subprocess
-import sys
+import signal
 import tempfile
-from collections.abc import Callable, Iterator
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
+from itertools import count
 from pathlib import Path
 from typing import Any
 
-LIBRARY = "PBDKIT_DISK_FAULTS"
-"""The variable of the environment that names the library, which is preloaded then."""
-KINDS = {"EIO": 1, "short": 2, "full": 3}
-SKIPPED = 77
+from faults import Disk, arm, changes, load
+
+MEMORY_KINDS = ("memory", "block")
+POWER_KINDS = ("power", "torn")
+KINDS = ("eio", "enospc", "short", "kill", *POWER_KINDS, *MEMORY_KINDS)
 MEMORY = Path("/dev/shm")
 """A file system that need not wait for a disk."""
+LEAST = 2**16
+"""Number of bytes of the smallest allocation that fails."""
 
-
-def preloaded() -> Any:
-    """The library, in a process that has it; else this script is run once more in one that has, and
-    this process ends as that does."""
-    if LIBRARY in os.environ:
-        library = ctypes.CDLL(os.environ[LIBRARY])
-        library.disk_faults_calls.restype = ctypes.c_long
-        return library
-    compiler = shutil.which("cc")
-    if compiler is None or not sys.platform.startswith("linux"):
-        print("skipped: the faults need Linux and a C compiler named cc")
-        raise SystemExit(SKIPPED)
-    with tempfile.TemporaryDirectory() as folder:
-        library = str(Path(folder, "disk_faults.so"))
-        source = str(Path(__file__).with_suffix(".c"))
-        subprocess.run(
-            [compiler, "-O2", "-shared", "-fPIC", "-o", library, source, "-ldl"], check=True
-        )
-        more = {LIBRARY: library, "LD_PRELOAD": library, "SOURCE_DATE_EPOCH": "0"}
-        done = subprocess.run([sys.executable, *sys.argv], env=os.environ | more, check=False)
-    raise SystemExit(done.returncode)
-
-
-FAULTS = preloaded() if __name__ == "__main__" else None
+FAULTS = load(__file__) if __name__ == "__main__" else None
 if FAULTS:
-    from trials import BASE, BREAKING, differences, ended, often, started
+    from trials import BASE, BREAKING, differences, ended, network, often, started
 
     import pbdkit
     from pbdkit.cli import main
+    from pbdkit.errors import PbdkitError
+    from pbdkit.io.run_store import status_of
     from pbdkit.io.seal import SealedFile
     from pbdkit.io.sinks import OverlappingSink
 
 SMALL = {
-    "body": {"type": "grid", "columns": 10, "rows": 8},
-    "steps": 5,
-    "diagnostics": [{"type": "pe1"}, {"type": "broken"}],
+    "body": {"type": "grid", "columns": 5, "rows": 4},
+    "steps": 3,
+    "diagnostics": [{"type": "broken"}],
 }
-SWEEP = {"vary": {"solver.relaxation": [0.5, 1.0]}, "keep": {"variables": ["pe1"], "times": "last"}}
+SWEEP = {"vary": {"solver.relaxation": [0.5, 1.0]}, "keep": {"variables": ["broken"], "times": "last"}}
 FIT = {
     "experiment": {
         "name": "plate",
@@ -105,6 +104,10 @@ LOGS = re.compile(r".*\.sqlite-(wal|shm)|s/set-aside.*")
 sweep sets aside if it cannot read a database."""
 
 
+PROJECT = re.compile(r"\.pbdkit-mine\..*")
+"""Folder of a project that a killed process was writing."""
+
+
 @dataclass
 class Command:
     """One command, in a folder that is prepared for it; `output` is what it writes."""
@@ -118,7 +121,7 @@ class Command:
         default=lambda one, other: _same_bytes(one, other)
     )
     again: Callable[[], list[str]] | None = None
-    """The command by which one comes to the result after a fault that left parts of it."""
+    """The command by which one comes to the result after a fault; by default the same one."""
 
 
 def _same_bytes(one: Path, other: Path) -> list[str]:
@@ -136,6 +139,8 @@ def _same_bytes(one: Path, other: Path) -> list[str]:
 
 
 def _same_run(one: Path, other: Path) -> list[str]:
+    if not _same_bytes(one, other):  # without gaps that depend on the commits
+        return []
     try:
         return differences(one, other)
     except Exception as error:  # whatever a broken file leads to
@@ -143,6 +148,8 @@ def _same_run(one: Path, other: Path) -> list[str]:
 
 
 def _same_sweep(one: Path, other: Path) -> list[str]:
+    if not _same_bytes(one, other):
+        return []
     try:
         for path in (one, other):
             with SealedFile(path) as file:
@@ -162,11 +169,21 @@ def _same_page(one: Path, other: Path) -> list[str]:
     return [] if texts[0] == texts[1] else [f"{one}: another text"]
 
 
+def steady(seed: int) -> None:
+    """Let random names and measured times be the same in each execution of a command, so that equal
+    states of the folder are recognized. The time of day stands still, by faults.c."""
+    draw, ticks = random.Random(seed), count()
+    secrets.token_bytes = lambda size=16: draw.randbytes(size)  # type: ignore[misc]
+    secrets.token_hex = lambda size=16: draw.randbytes(size).hex()  # type: ignore[misc]
+    time.perf_counter = lambda: 1e-3 * next(ticks)
+
+
 def quietly(*words: str, before: Callable[[], object] = lambda: None) -> tuple[int, str]:
     """A command without faults, in the current folder."""
     log = Path.cwd().with_name("log")
 
     def work() -> None:
+        steady(1)
         before()
         main([*words])
 
@@ -201,7 +218,7 @@ def _each_step() -> None:
     OverlappingSink.due = lambda self: True  # type: ignore[method-assign]
 
 
-def _unfinished() -> None:
+def _unfinished(begin: Callable[[], object] = _each_step) -> None:
     """A run that is killed at its second commit."""
     from pbdkit.io.run_store import UnfinishedRun
 
@@ -209,7 +226,7 @@ def _unfinished() -> None:
     keep, left = UnfinishedRun.keep, [2]
 
     def killed() -> None:
-        _each_step()
+        begin()
 
         def keeping(*given: Any) -> None:
             left[0] -= 1
@@ -225,7 +242,24 @@ def _unfinished() -> None:
 
 def _resume() -> list[str]:
     """After a fault of a run: resumed where anything is kept, else run."""
-    return ["resume", "out.nc"] if Path("out.nc.run").exists() else [*RUN, "--force"]
+    if status_of(Path("out.nc")) or Path("out.nc").exists():
+        return ["resume", "out.nc"]
+    return RUN
+
+
+def _lengthened() -> list[str]:
+    """After a fault of a run that is continued beyond its end."""
+    return ["resume", "out.nc"] if status_of(Path("out.nc")) else LONGER
+
+
+def _on_network(begin: Callable[[], object] = lambda: None) -> Callable[[], None]:
+    """As on a disk of another machine, where SQLite has a journal."""
+
+    def before() -> None:
+        begin()
+        network()
+
+    return before
 
 
 def _fitting() -> None:
@@ -240,25 +274,13 @@ def _fitting() -> None:
     Path("out.png").write_text("earlier")
 
 
-def _fitted_once() -> Callable[[], None]:
-    """A fit writes nothing while it computes, so that one serves all trials."""
-    found: list[Any] = []
-
-    def before() -> None:
-        if not found:
-            found.append(pbdkit.fit("f.json"))
-        pbdkit.fit = lambda file: found[0]
-
-    return before
-
-
 def _sweeping() -> None:
     _experiment()
     Path("s.json").write_text(json.dumps({"experiment": "e.json"} | SWEEP))
 
 
 def _earlier_run() -> None:
-    _experiment(steps=3)
+    _experiment(steps=2)
     assert quietly("run", "e.json", "-o", "out.nc")[0] == 0
     _experiment()
 
@@ -269,7 +291,7 @@ def _finished() -> None:
 
 
 RUN = ["run", "e.json", "-o", "out.nc", "--quiet"]
-LONGER = ["resume", "out.nc", "--steps", "9"]
+LONGER = ["resume", "out.nc", "--steps", "5"]
 SWEEPING = ["sweep", "s.json", "-o", "s", "--workers", "1"]
 FITTING = ["fit", "f.json", "-o", "out.json", "--force"]
 PLOTTED = ["--plot", "out.png"]
@@ -284,12 +306,24 @@ def commands() -> dict[str, Command]:
         "resume": Command(
             ["resume", "out.nc"], "out.nc", _unfinished, _each_step, _same_run, _resume
         ),
-        "longer": Command(LONGER, "out.nc", _finished, _each_step, _same_run, lambda: LONGER),
-        "sweep": Command(
-            SWEEPING, "s/sweep.nc", _sweeping, same=_same_sweep, again=lambda: SWEEPING
+        "longer": Command(LONGER, "out.nc", _finished, _each_step, _same_run, _lengthened),
+        "sweep": Command(SWEEPING, "s/sweep.nc", _sweeping, same=_same_sweep),
+        "store in a journal": Command(
+            RUN, "out.nc", _experiment, _on_network(_each_step), _same_run, _resume
         ),
-        "fit": Command(FITTING, "out.json", _fitting, _fitted_once()),
-        "fit --plot": Command([*FITTING, *PLOTTED], "out.png", _fitting, _fitted_once()),
+        "resume in a journal": Command(
+            ["resume", "out.nc"],
+            "out.nc",
+            lambda: _unfinished(_on_network(_each_step)),
+            _on_network(_each_step),
+            _same_run,
+            _resume,
+        ),
+        "sweep in a journal": Command(
+            SWEEPING, "s/sweep.nc", _sweeping, _on_network(), same=_same_sweep
+        ),
+        "fit": Command(FITTING, "out.json", _fitting),
+        "fit --plot": Command([*FITTING, *PLOTTED], "out.png", _fitting),
         "init": Command(["init", "out.yaml"], "out.yaml"),
         "init --from": Command(
             ["init", "out.yaml", "--from", "modelling/measured-boundary"], "out.yaml"
@@ -307,23 +341,37 @@ def commands() -> dict[str, Command]:
     return found
 
 
+@dataclass
+class Outcome:
+    """The trials of one command with one kind of fault."""
+
+    calls: int
+    trials: int = 0
+    broken: int = 0
+    crashes: Counter[str] = field(default_factory=Counter)
+    """Crashes in libraries without memory, by the library."""
+    messages: Counter[str] = field(default_factory=Counter)
+
+
 class Bench:
     """The trials of one command."""
 
-    def __init__(self, command: Command, root: Path) -> None:
-        self.command, self._root = command, root
+    def __init__(self, command: Command, root: Path, least: int) -> None:
+        self.command, self._root, self._least = command, root, least
         self._start, self._whole, self._folder = root / "start", root / "whole", root / "trial"
-        self._log = root / "log"
+        self._log, self._record = root / "log", root / "record"
+        self._known: dict[str, list[str]] = {}
+        """Findings of the next command, by the state of the folder before it."""
         self._start.mkdir(parents=True)
         os.chdir(self._start)
         command.prepare()
         self._fresh(self._whole)
-        command.before()
         with suppress(SystemExit):  # in this process, which finds all of it loaded from then on
             main([*command.words])
+        self._fresh(self._whole)
+        assert quietly(*command.words, before=command.before)[0] == 0
         assert Path(command.output).exists()
-        assert self._trial(0, 0) == (0, [])
-        self.calls = FAULTS.disk_faults_calls()
+        gc.freeze()  # so that the processes that are forked copy less memory
 
     def _fresh(self, folder: Path) -> None:
         os.chdir(self._root)
@@ -331,45 +379,118 @@ class Bench:
         shutil.copytree(self._start, folder)
         os.chdir(folder)
 
-    def _trial(self, number: int, kind: int) -> tuple[int, list[str]]:
-        """The exit status, and what is wrong."""
-        self._fresh(self._folder)
+    def _carried_out(self, kind: str, number: int) -> tuple[int, str]:
+        """Return the exit status and the output of the command with a fault."""
 
         def work() -> None:
+            steady(0)
             self.command.before()
-            FAULTS.disk_faults_arm(os.fsencode(self._folder), ctypes.c_long(number), kind)
+            log = str(self._record)
+            arm(FAULTS, self._folder, kind, number, least=self._least, log=log)
             main([*self.command.words])
 
         code = ended(started(work, self._log), 120.0)
-        return code, list(self._judged(code, self._log.read_text(errors="replace")))
+        return code, self._log.read_text(errors="replace")
 
-    def _judged(self, code: int, said: str) -> Iterator[str]:
-        output = Path(self.command.output)
-        whole, earlier = self._whole / output, self._start / output
-        if code not in (0, 6):
+    def tried(self, kind: str, first: int, every: int) -> Iterator[tuple[Outcome, list[str]]]:
+        """Carry out the trials; generate the present outcome and the findings of each."""
+        states = self._power_cuts if kind in POWER_KINDS else self._faults
+        for outcome, number, code, said in states(kind, first, every):
+            outcome.trials += 1
+            outcome.messages[said.strip()] += 1
+            findings = list(self._judged(kind, code, said, outcome))
+            outcome.broken += bool(findings)
+            yield outcome, [f"call {number} of {outcome.calls}: {text}" for text in findings]
+
+    def _faults(
+        self, kind: str, first: int, every: int
+    ) -> Iterator[tuple[Outcome, int, int, str]]:
+        self._fresh(self._folder)
+        code, said = self._carried_out(kind, 0)
+        outcome = Outcome(FAULTS.faults_calls())
+        assert code == 0, said
+        for number in range(first, outcome.calls + 1, every):
+            self._fresh(self._folder)
+            yield outcome, number, *self._carried_out(kind, number)
+
+    def _power_cuts(
+        self, kind: str, first: int, every: int
+    ) -> Iterator[tuple[Outcome, int, int, str]]:
+        """Repeat one recorded execution up to each call, and write what is on the disk then."""
+        self._fresh(self._folder)
+        disk = Disk(self._folder)
+        code, said = self._carried_out("record", 0)
+        outcome = Outcome(FAULTS.faults_calls())
+        assert code == 0, said
+        recorded = list(changes(self._record))
+        whole = Disk(self._folder)
+        left = iter(recorded)
+        change = next(left, None)
+        os.chdir(self._root)
+        for number in range(1, outcome.calls + 2):  # the last power cut is after the last call
+            while change and change.number < number:
+                disk.repeat(change)
+                change = next(left, None)
+            if number < first or (number - first) % every:
+                continue
+            shutil.rmtree(self._folder, ignore_errors=True)
+            if kind == "power":
+                disk.lost(self._folder)
+            else:
+                disk.torn(self._folder, random.Random(number))
+            os.chdir(self._folder)
+            yield outcome, number, 0 if number > outcome.calls else -signal.SIGKILL, ""
+            os.chdir(self._root)
+        assert disk.content("-shm") == whole.content("-shm"), "the record is not complete"
+
+    def _judged(self, kind: str, code: int, said: str, outcome: Outcome) -> Iterator[str]:
+        killed = code == -signal.SIGKILL and kind in ("kill", *POWER_KINDS)
+        if kind in MEMORY_KINDS and code < 0:
+            outcome.crashes[said.strip().splitlines()[-1] if said.strip() else str(code)] += 1
+            killed = True
+        yield from self._answered(kind, 0 if killed else code, said)
+        yield from self._standing(0 if killed else code, killed)
+        if code:
+            state = self._state()
+            if state not in self._known:
+                self._known[state] = list(self._completed())
+            yield from self._known[state]
+
+    def _answered(self, kind: str, code: int, said: str) -> Iterator[str]:
+        """Check the exit status and the message."""
+        lines = [line for line in said.splitlines() if line.startswith("pbdkit")]
+        if code not in ((0,) if kind == "short" else (0, 6)):
             yield f"exit {code}: {said[-300:]}"
         if "a bug in pbdkit" in said or "Traceback" in said:
-            yield f"says {said[-300:]}"
+            yield f"message {said[-300:]}"
         if "is damaged" in said.replace("where it is damaged", ""):
-            yield f"blames a sound file: {said[-300:]}"
-        if (
-            code == 6
-            and len([line for line in said.splitlines() if line.startswith("pbdkit")]) != 1
-        ):
+            yield f"a sound file is called damaged: {said[-300:]}"
+        if code == 6 and len(lines) != 1:
             yield f"not one message: {said!r}"
-        left = [p for p in self._left() if not (LOGS if code == 0 else STORES).fullmatch(p)]
-        if left:
-            yield f"exit {code}, left behind: {left}"
-        if code == 0 and not output.exists():
-            yield "exit 0, and no output"
-        elif code == 0:
-            yield from self.command.same(output, whole)
-        elif output.exists() and not (earlier.exists() and not _same_bytes(output, earlier)):
+        elif code == 6 and "memory" not in said and not any(n in said for n in self._names()):
+            yield f"no place: {said!r}"
+
+    def _names(self) -> list[str]:
+        """Return the names that a message may give as the place."""
+        paths = (*self._start.rglob("*"), *self._whole.rglob("*"))
+        return [path.name for path in paths] + [self.command.output]
+
+    def _standing(self, code: int, killed: bool) -> Iterator[str]:
+        """Check what is in the folder after the command."""
+        output = Path(self.command.output)
+        whole, earlier = self._whole / output, self._start / output
+        if not killed:
+            left = [p for p in self._left() if not (LOGS if code == 0 else STORES).fullmatch(p)]
+            if left:
+                yield f"exit {code}, left behind: {left}"
+        if output.exists() and not (
+            (killed or code) and earlier.exists() and not _same_bytes(output, earlier)
+        ):
             yield from (f"exit {code}, and {text}" for text in self.command.same(output, whole))
-        elif earlier.exists() and not output.exists():
+        elif not output.exists() and earlier.exists():
             yield "the earlier file is gone"
-        if code == 6 and self.command.again:
-            yield from self._resumed(self.command.again(), output, whole)
+        elif not output.exists() and not code and not killed:
+            yield "exit 0, and no output"
 
     def _left(self) -> list[str]:
         """Return the files in the folder that the undisturbed command does not leave."""
@@ -378,28 +499,34 @@ class Bench:
         ]
         return sorted(names[0] - names[1])
 
-    def _resumed(self, words: list[str], output: Path, whole: Path) -> Iterator[str]:
+    def _state(self) -> str:
+        """Return a checksum of all names and contents in the folder, without those of the memory
+        that processes share, and without numbers of processes in hidden names."""
+        found = hashlib.sha256()
+        for path in sorted(self._folder.rglob("*")):
+            data = b"" if path.is_dir() or path.name.endswith("-shm") else path.read_bytes()
+            name = re.sub(r"\.\d+\.[0-9a-f]{32}", "", str(path))
+            found.update(f"{name} {len(data)} ".encode() + data)
+        return found.hexdigest()
+
+    def _completed(self) -> Iterator[str]:
         """The next command comes to the same result."""
+        output = Path(self.command.output)
+        whole = self._whole / output
+        was_whole = output.exists() and not self.command.same(output, whole)
+        try:
+            words = self.command.again() if self.command.again else self.command.words
+        except PbdkitError as error:
+            yield f"then {error}"
+            return
         code, said = quietly(*words, before=self.command.before)
-        if code:
-            yield f"then exit {code}: {said[-300:]}"
+        if code and not (code == 2 and was_whole):  # the output exists, and is complete
+            yield f"then {words[0]}: exit {code}: {said[-300:]}"
             return
         yield from (f"then {text}" for text in self.command.same(output, whole))
-        if left := [p for p in self._left() if not LOGS.fullmatch(p)]:
+        left = [p for p in self._left() if not LOGS.fullmatch(p)]
+        if code == 0 and left and not all(PROJECT.fullmatch(name) for name in left):
             yield f"then left behind: {left}"
-
-    def tried(self, kind: str, first: int, every: int) -> tuple[int, list[str]]:
-        """Return the number of trials, and their findings."""
-        numbers = range(first, self.calls + 1, every)
-        findings = []
-        for number in numbers:
-            code, found = self._trial(number, KINDS[kind])
-            if kind == "short" and code:
-                found.append(f"exit {code} for what is no fault")
-            findings += (
-                [f"{kind} at call {number} of {self.calls}: {'; '.join(found)}"] if found else []
-            )
-        return len(numbers), findings
 
 
 def _prepare_drawing() -> None:
@@ -410,29 +537,48 @@ def _prepare_drawing() -> None:
     matplotlib.rcParams["svg.hashsalt"] = "the same in every trial"
 
 
+def _chosen(names: str, known: Iterable[str]) -> list[str]:
+    chosen = names.split(",") if names else [*known]
+    if unknown := {*chosen} - {*known}:
+        raise SystemExit(f"unknown: {', '.join(unknown)}; known: {', '.join(known)}")
+    return chosen
+
+
 def _main() -> None:
     asked = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    asked.add_argument("--commands", default="")
-    asked.add_argument("--kinds", default=",".join(KINDS))
+    asked.add_argument("--command", default="", help="commands, separated by commas")
+    asked.add_argument("--kind", default="", help="kinds of faults, separated by commas")
     asked.add_argument("--first", type=int, default=1)
     asked.add_argument("--every", type=int, default=1)
+    asked.add_argument("--least", type=int, default=LEAST, help="smallest allocation that fails")
+    asked.add_argument("--messages", action="store_true", help="print each message")
     given = asked.parse_args()
     _prepare_drawing()
-    total = broke = 0
-    every = commands()
-    for name in given.commands.split(",") if given.commands else every:
+    known, broken, rows = commands(), 0, []
+    kinds = _chosen(given.kind, KINDS)
+    for name in _chosen(given.command, known):
         with tempfile.TemporaryDirectory(dir=MEMORY if MEMORY.is_dir() else None) as folder:
-            bench = Bench(every[name], Path(folder).resolve())
-            for kind in given.kinds.split(","):
-                count, findings = bench.tried(kind, given.first, given.every)
-                for text in findings:
-                    print(f"  {name}, {text}", flush=True)
-                held = f"{count - len(findings)} of {count} held, of {bench.calls} calls"
-                print(f"{name}, {kind}: {held}", flush=True)
-                total, broke = total + count, broke + len(findings)
+            bench = Bench(known[name], Path(folder).resolve(), given.least)
+            for kind in kinds:
+                outcome = Outcome(0)
+                for outcome, findings in bench.tried(kind, given.first, given.every):
+                    for text in findings:
+                        print(f"  {name}, {kind}, {text}", flush=True)
+                for crash, count in outcome.crashes.items():
+                    print(f"  {name}, {kind}, {count} times {crash}", flush=True)
+                if given.messages:
+                    for text, count in outcome.messages.most_common():
+                        print(f"  {name}, {kind}, {count} times {text!r}", flush=True)
+                held = outcome.trials - outcome.broken
+                crashes = outcome.crashes.total()
+                rows.append((name, kind, outcome.calls, outcome.trials, held, outcome.broken, crashes))
+                print(*rows[-1], sep=" | ", flush=True)
+                broken += outcome.broken
             os.chdir("/")
-    print(f"{total - broke} of {total} held", flush=True)
-    raise SystemExit(broke > 0)
+    heads = ("command", "kind", "calls", "trials", "held", "broken", "crashes in a library")
+    print("", *(" | ".join(map(str, row)) for row in (heads, *rows)), sep="\n")
+    print(f"{sum(row[4] for row in rows)} of {sum(row[3] for row in rows)} held", flush=True)
+    raise SystemExit(broken > 0)
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ with that of the uninterrupted run, bit for bit.
 from __future__ import annotations
 
 import argparse
-import io
 import os
 import random
 import signal
@@ -22,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from faults import arm, load
 from trials import (
     EXPERIMENTS,
     OUTPUT,
@@ -30,6 +30,7 @@ from trials import (
     differences,
     done,
     ended,
+    network,
     often,
     recorded,
     reference,
@@ -38,8 +39,7 @@ from trials import (
 )
 
 from pbdkit.errors import PbdkitError
-from pbdkit.io import run_store, run_store as unfinished, sqlite_file
-from pbdkit.io.atomic_file import is_local
+from pbdkit.io import run_store as unfinished
 from pbdkit.io.run_store import status_of
 
 KINDS = tuple(EXPERIMENTS)
@@ -65,50 +65,19 @@ def acknowledging(then: Callable[[], object] = often) -> Callable[[], None]:
     return begin
 
 
-def dying(at: int) -> Callable[[], None]:
-    """Make a process end at the n-th call by which it changes the disk, before or after it;
-    SQLite's own calls, which are invisible to Python, count as one a commit."""
-
-    def begin() -> None:
-        left = at
-
-        def counted(call: Callable[..., Any]) -> Callable[..., Any]:
-            def counting(*args: Any, **more: Any) -> Any:
-                nonlocal left
-                left -= 1
-                if left == 0:
-                    os.kill(os.getpid(), signal.SIGKILL)
-                found = call(*args, **more)
-                left -= 1
-                if left == 0:
-                    os.kill(os.getpid(), signal.SIGKILL)
-                return found
-
-            return counting
-
-        class File(io.FileIO):
-            write = counted(io.FileIO.write)
-            truncate = counted(io.FileIO.truncate)
-
-        io.FileIO = File
-        for name in ("fsync", "link", "unlink", "rename", "replace"):
-            setattr(os, name, counted(getattr(os, name)))
-        run_store.RunStore.commit = counted(run_store.RunStore.commit)
-        run_store.RunStore.__init__ = counted(run_store.RunStore.__init__)
-
-    return begin
-
-
-def network() -> None:
-    """Takes the disk for one of another machine: no write-ahead log."""
-    sqlite_file.is_local = lambda path: is_local(path, mounts="/nowhere")
+def dying(library: Any, at: int) -> None:
+    """Make this process end at the n-th call on files in the current folder; the calls of SQLite
+    within a commit count too."""
+    arm(library, Path.cwd(), "kill", at)
 
 
 class Trial:
     """One run in the current folder, killed and resumed until it has ended."""
 
-    def __init__(self, seed: str, whole: Path, seconds: float, parts: dict[str, Any]) -> None:
-        self.draw, self.seconds = random.Random(seed), seconds
+    def __init__(
+        self, library: Any, seed: str, whole: Path, seconds: float, parts: dict[str, Any]
+    ) -> None:
+        self.library, self.draw, self.seconds = library, random.Random(seed), seconds
         self.whole, self.found = whole, []
         self.kills = self.lost = self.unreadable = 0
         write_experiment(parts, Path.cwd())
@@ -146,8 +115,8 @@ class Trial:
             time.sleep(self.draw.uniform(0.0, 1.1 * self.seconds))
             os.kill(pid, signal.SIGKILL)
             return ended(pid), log.read_text()
-        deadly = dying(int(10 ** self.draw.uniform(0.0, 2.7)))
-        return done(*command, log=log, before=lambda: (begin(), deadly()))
+        number = int(10 ** self.draw.uniform(0.0, 2.7))
+        return done(*command, log=log, before=lambda: (begin(), dying(self.library, number)))
 
     def looked_at(self, before: list[str]) -> list[str]:
         """Return the next command; compares the files with the acknowledged steps."""
@@ -209,16 +178,19 @@ def main() -> None:
     asked.add_argument("--only", type=int)
     asked.add_argument("--kinds", nargs="+", default=[*KINDS])
     given = asked.parse_args()
+    library = load(__file__)
     print(f"seed {given.seed}")
     numbers = range(given.trials) if given.only is None else [given.only]
-    failed, kills, lost, unreadable = tried(given.seed, numbers, given.kinds)
+    failed, kills, lost, unreadable = tried(library, given.seed, numbers, given.kinds)
     row("kill -9: acknowledged records lost 0", f"{lost} in {len(numbers)} runs, {kills} kills")
     row("kill -9: unreadable runs 0", f"{unreadable} in {len(numbers)}")
     row("kill -9: resumed runs that differ in a bit 0", f"{failed} in {len(numbers)}")
     raise SystemExit(failed > 0)
 
 
-def tried(seed: int, numbers: Any, kinds: list[str]) -> tuple[int, int, int, int]:
+def tried(
+    library: Any, seed: int, numbers: Any, kinds: list[str]
+) -> tuple[int, int, int, int]:
     """Trials that found something, kills, records lost, runs unreadable."""
     failed = kills = lost = unreadable = 0
     here = Path.cwd()
@@ -229,7 +201,7 @@ def tried(seed: int, numbers: Any, kinds: list[str]) -> tuple[int, int, int, int
             folder = Path(name, str(number))
             folder.mkdir()
             os.chdir(folder)
-            trial = Trial(f"{seed}/{number}", *wholes[kind], EXPERIMENTS[kind])
+            trial = Trial(library, f"{seed}/{number}", *wholes[kind], EXPERIMENTS[kind])
             for finding in trial.run():
                 print(f"{number} ({kind}): {finding}", flush=True)
             failed, kills = failed + bool(trial.found), kills + trial.kills

@@ -30,7 +30,8 @@ import pbdkit.io.run_store
 import pbdkit.restart
 import pbdkit.stability.forecast
 from pbdkit.cli import main
-from pbdkit.io import netcdf as netcdf_sink
+from pbdkit.io import netcdf as netcdf_sink, sqlite_file
+from pbdkit.io.atomic_file import is_local
 from pbdkit.io.netcdf import FINAL_STATE, NetcdfSink
 from pbdkit.io.seal import SealedFile, open_sealed
 
@@ -88,6 +89,11 @@ def often(first_s: float = 0.0) -> None:
     assert kinds is not None
     kinds["first_s"] = first_s
     netcdf_sink.EVERY_S, netcdf_sink.SHARE = 0.0, 0
+
+
+def network() -> None:
+    """Take the disk for one of another machine: no write-ahead log."""
+    sqlite_file.is_local = lambda path: is_local(path, mounts="/nowhere")
 
 
 def started(work: Callable[[], object], log: Path) -> int:
