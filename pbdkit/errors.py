@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import errno
 import sys
 import warnings
 from collections.abc import Iterable, Sequence
@@ -135,6 +136,29 @@ class WriteError(StorageError):
     The message begins with the name of this file. If the error occurs while another file is read,
     the name of that file is not added to the message.
     """
+
+
+REMEDIES = {
+    errno.EIO: "; the disk failed: repeat the command, and check the disk if it fails again",
+    errno.ENOSPC: "; free some space, and repeat the command",
+    errno.EDQUOT: "; free some space, and repeat the command",
+    errno.EMFILE: "; raise the limit (`ulimit -n`), or use fewer processes",
+    errno.ENFILE: "; raise the limit (`ulimit -n`), or use fewer processes",
+}
+"""Remedies for failures of the disk and for limits of the system, by the number of the error."""
+
+
+def reason_of(error: OSError) -> str:
+    """Return the reason for which the operating system refused an operation, with the remedy if
+    there is one."""
+    return f"{error.strerror or error}{REMEDIES.get(error.errno or 0, '')}"
+
+
+def unreadable(path: Any, error: OSError) -> PbdkitError:
+    """Return the error for an input file that cannot be read: a StorageError if the disk or the
+    system fails, and an ExperimentError otherwise, for instance if there is no such file."""
+    kind = StorageError if error.errno in REMEDIES else ExperimentError
+    return kind(f"{path}: cannot be read: {reason_of(error)}")
 
 
 class PbdkitWarning(UserWarning):

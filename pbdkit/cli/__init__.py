@@ -36,15 +36,8 @@ neighbours by rules instead of forces. An experiment file describes the run; its
 result is a dataset.
 """
 """Text that is printed if no command is given."""
-SYSTEM = dict.fromkeys(
-    (errno.EIO, errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.ENAMETOOLONG), ""
-)
-"""Errors of the operating system that no defect of pbdkit causes. The value is the remedy."""
-SYSTEM |= dict.fromkeys(
-    (errno.EMFILE, errno.ENFILE),
-    "; raise the limit (`ulimit -n`), or use fewer processes",
-)
-"""Remedies for errors of the operating system by number; they are no defects of pbdkit."""
+SYSTEM = {*errors.REMEDIES, errno.EFBIG, errno.EROFS, errno.ENAMETOOLONG}
+"""Errors of the operating system that no defect of pbdkit causes, by number."""
 MORE = """\
 `pbdkit COMMAND --help` describes a command, `pbdkit --help` all options."""
 """Hint to further help."""
@@ -161,7 +154,7 @@ def _report(error: BaseException) -> int:
         return _failed("interrupted", 130)
     if isinstance(error, OSError) and error.errno in SYSTEM:
         place = f"{error.filename}: " if error.filename else ""
-        return _failed(f"{place}{error.strerror}{SYSTEM[error.errno]}", 6)
+        return _failed(f"{place}{errors.reason_of(error)}", 6)
     what = f"a bug in pbdkit, please report it: {type(error).__name__}: {error}"
     return _failed(f"{what} (`pbdkit --debug ...` shows where)", 1)
 

@@ -44,10 +44,17 @@ def init(file: Path | None, origin: str | None) -> None:
         copy = f"`pbdkit init {path.name}{SUFFIX} --from {path}` copies it"
         raise ExperimentError(f"{path}: is the name of a shipped experiment, not a file; {copy}")
     data = shipped_data(origin) if origin else []
-    files = {path.with_name(d.name): d.read_bytes() for d in data} | {path: text.encode()}
+    tables = {path.with_name(d.name): d.read_bytes() for d in data}
+    # An earlier call that was killed may have written some of the tables.
+    files = {t: c for t, c in tables.items() if not _contains(t, c)} | {path: text.encode()}
     for target in files:
         if os.path.lexists(target):
             raise ExperimentError(f"{target}: exists and is not replaced; name another file")
     write_together(files)
     remark = f" with {', '.join(d.name for d in data)}" if data else ""
     click.echo(f"{path} written{remark}; next: pbdkit check {path}, then pbdkit run {path}")
+
+
+def _contains(path: Path, content: bytes) -> bool:
+    """Return whether a file exists and has a content."""
+    return path.is_file() and path.read_bytes() == content

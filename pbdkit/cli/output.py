@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from pbdkit.errors import ExperimentError, StorageError, refuse_no_matplotlib
+from pbdkit.errors import ExperimentError, StorageError, reason_of, refuse_no_matplotlib
 from pbdkit.io.atomic_file import kind_of, write
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ def refusals_as(subject: str) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise StorageError(f"{subject}: {error.strerror}") from None
+        raise StorageError(f"{subject}: {reason_of(error)}") from None
 
 
 def refuse_output(path: Path, *, force: bool, experiment: Path | None = None) -> None:

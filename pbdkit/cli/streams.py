@@ -11,7 +11,7 @@ from contextlib import chdir, contextmanager, suppress
 from pathlib import Path
 from typing import Any, TextIO
 
-from pbdkit.errors import PbdkitError, StorageError, WriteError
+from pbdkit.errors import PbdkitError, StorageError, WriteError, reason_of
 
 
 class NoReaderError(PbdkitError):
@@ -99,7 +99,7 @@ class _Output(io.FileIO):
             self._failed = True
             if isinstance(error, BrokenPipeError):
                 raise NoReaderError("standard output has no reader") from None
-            reason = "is closed" if error.errno == errno.EBADF else error.strerror
+            reason = "is closed" if error.errno == errno.EBADF else reason_of(error)
             raise WriteError(f"standard output: {reason}") from None
 
 

@@ -49,7 +49,7 @@ def _refuse_elsewhere(file: Path) -> None:
     """Raise StorageError if a file with a correct checksum refers to other files."""
     try:
         open_sealed(file).close()
-    except StorageError:
+    except (StorageError, MemoryError):
         raise
     except Exception as error:  # h5py raises errors of many types
         raise StorageError(f"{file}: cannot be read as netCDF-4: {one_line(str(error))}") from None

@@ -21,7 +21,7 @@ from itertools import chain, count
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pbdkit.errors import WriteError
+from pbdkit.errors import WriteError, reason_of
 
 LOCAL = {"apfs", "bcachefs", "btrfs", "ext2", "ext3", "ext4", "f2fs", "hfs", "jfs", "overlay"}
 LOCAL |= {"ramfs", "reiserfs", "tmpfs", "xfs", "zfs"}
@@ -322,7 +322,7 @@ def _refusing(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        raise WriteError(f"{path}: cannot be written: {error.strerror or error}") from None
+        raise WriteError(f"{path}: cannot be written: {reason_of(error)}") from None
 
 
 def _hidden(name: str, random: str = "") -> str:

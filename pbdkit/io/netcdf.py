@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from pbdkit.array_types import Array
-from pbdkit.errors import StorageError, WriteError
+from pbdkit.errors import StorageError, WriteError, reason_of
 from pbdkit.io.atomic_file import FULL, Destination, is_full
 from pbdkit.io.checkpoint import Checkpoint
 from pbdkit.io.layout import Column, Values, When
@@ -422,7 +422,7 @@ class NetcdfSink(KeepingSink):
         full = is_full(self._destination.path.absolute().parent)
         if full or getattr(error, "errno", None) == errno.ENOSPC:
             return FULL
-        return str(getattr(error, "strerror", None) or error)
+        return reason_of(error) if isinstance(error, OSError) else str(error)
 
 
 def reopen_dataset(
@@ -440,7 +440,7 @@ def reopen_dataset(
         raise StorageError("the dataset in the store is not that of the experiment")
     try:
         dataset.reopen({n: [np.asarray(v) for v in batch] for n, batch in waiting.items()}, written)
-    except StorageError:
+    except (StorageError, MemoryError):
         raise
     except Exception as error:  # The libraries raise various errors for damaged files.
         raise StorageError(f"the file in the store is damaged: {error}") from None

@@ -15,6 +15,7 @@ from pbdkit.errors import (
     StorageWarning,
     WriteError,
     one_line,
+    reason_of,
     warn_caller,
 )
 from pbdkit.io.layout import SCHEMA_VERSION, base_columns, in_this_layout
@@ -78,13 +79,13 @@ def open(path: str | Path) -> xarray.Dataset:
         refuse_no_file(file)
     try:
         dataset = in_this_layout(_unfinished(unfinished) if unfinished else _opened(file))
-    except PbdkitError:
+    except (PbdkitError, MemoryError):
         raise
     except Exception as error:  # The libraries raise various errors for damaged files.
         if not unfinished:
             with SealedFile(file) as content:
                 content.check()
-        reason = getattr(error, "strerror", None) or error
+        reason = reason_of(error) if isinstance(error, OSError) else error
         raise StorageError(f"{file}: cannot be read as netCDF-4: {reason}") from None
     if fault := fault_of(dataset):
         dataset.close()

@@ -22,7 +22,7 @@ import xxhash
 from numpy.typing import NDArray
 
 from pbdkit.array_types import Array
-from pbdkit.errors import ExperimentError, StorageError
+from pbdkit.errors import ExperimentError, StorageError, reason_of
 from pbdkit.io.atomic_file import FULL, is_full, lock, open_locked, sync_folder
 from pbdkit.io.checkpoint import Arrays, Checkpoint
 from pbdkit.io.paged_file import (
@@ -187,7 +187,7 @@ class RunStore:
             try:
                 self._file = open_read_only(self.path, self._closing)
             except OSError as error:
-                raise StorageError(f"{self.path}: cannot be read: {error}") from None
+                raise StorageError(f"{self.path}: cannot be read: {reason_of(error)}") from None
         else:
             self._file = self._closing.enter_context(closing(connect(self.path, mode)))
         self._file.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_VALUE_BYTES)
@@ -404,7 +404,7 @@ def _exclusive(output: Path) -> Iterator[None]:
         except (FileNotFoundError, NotADirectoryError):
             continue
         except OSError as error:
-            raise StorageError(f"{path}: {error.strerror}") from None
+            raise StorageError(f"{path}: {reason_of(error)}") from None
         if file is None:
             raise busy_error(output)
         with file:
@@ -461,7 +461,7 @@ def header_of(records: Path) -> Header | None:
     except FileNotFoundError:
         return None
     except OSError as error:
-        raise StorageError(f"{records}: cannot be read: {error.strerror}") from None
+        raise StorageError(f"{records}: cannot be read: {reason_of(error)}") from None
 
 
 def _is_result(output: Path, store: RunStore) -> bool:
@@ -554,7 +554,7 @@ class UnfinishedRun:
         try:
             disk = open_locked(records) if writing else io.FileIO(records, "rb")
         except OSError as error:
-            raise StorageError(f"{records}: cannot be read: {error.strerror}") from None
+            raise StorageError(f"{records}: cannot be read: {reason_of(error)}") from None
         if disk is None:
             raise busy_error(output)
         try:

@@ -247,6 +247,8 @@ def wave_bound(scene: Scene) -> Bound | None:
     try:
         with errors_attributed_to(scene.experiment.rule, "when evaluated for plane waves"):
             eigenvalues = _eigenvalues(_symbols(scene)).ravel()
+    except MemoryError:
+        raise
     except (
         Exception,
         SystemExit,

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TextIO
 
-from pbdkit.errors import did_you_mean
+from pbdkit.errors import StorageError, did_you_mean, unreadable
 
 MAX_BYTES = 2**26
 """Maximum size of a table in bytes."""
@@ -25,6 +25,8 @@ def columns_of(path: Path, names: Sequence[str]) -> list[list[float]]:
     ------
     ValueError
         If the file cannot be read. The message contains the place and the remedy.
+    StorageError
+        If the disk fails.
     """
     try:
         if path.stat().st_size > MAX_BYTES:
@@ -32,9 +34,13 @@ def columns_of(path: Path, names: Sequence[str]) -> list[list[float]]:
         return list(_rows(path, names))
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: is not UTF-8: {error.reason}; save it as UTF-8") from None
-    except (OSError, csv.Error) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise ValueError(f"{path}: cannot be read: {reason}") from None
+    except OSError as error:
+        fault = unreadable(path, error)
+        if isinstance(fault, StorageError):
+            raise fault from None
+        raise ValueError(str(fault)) from None
+    except csv.Error as error:
+        raise ValueError(f"{path}: cannot be read: {error}") from None
 
 
 def _rows(path: Path, names: Sequence[str]) -> Iterator[list[float]]:

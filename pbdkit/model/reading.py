@@ -34,7 +34,7 @@ from ruamel.yaml.nodes import ScalarNode
 from ruamel.yaml.reader import ReaderError
 from ruamel.yaml.scanner import Scanner
 
-from pbdkit.errors import ExperimentError, dotted
+from pbdkit.errors import ExperimentError, dotted, unreadable
 
 if TYPE_CHECKING:
     from pydantic import ValidationInfo
@@ -183,12 +183,14 @@ def read_file(path: Path) -> Source:
     ------
     ExperimentError
         If the file cannot be read. The message contains the place and the remedy.
+    StorageError
+        If the disk fails.
     """
     try:
         with path.open("rb") as file:
             raw = file.read(MAX_BYTES + 1)
     except OSError as error:
-        raise ExperimentError(f"{path}: cannot be read: {error.strerror}") from None
+        raise unreadable(path, error) from None
     if raw.startswith((b"\x89HDF", b"CDF\x01", b"CDF\x02", b"CDF\x05")):
         raise ExperimentError(
             f"{path}: is a result, not an experiment; `pbdkit plot {path}` draws it, and "

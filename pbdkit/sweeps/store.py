@@ -21,7 +21,7 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Self
 
-from pbdkit.errors import StorageError
+from pbdkit.errors import StorageError, reason_of
 from pbdkit.io.atomic_file import FULL, is_full, lock, sync_folder
 from pbdkit.io.sqlite_file import (
     BEGINNING,
@@ -418,7 +418,7 @@ class Store:
             raise StorageError(f"{self._path}: {self._reason(error)}") from None
         except OSError as error:
             self._refuse_moved()
-            raise StorageError(f"{self._folder}: {error.strerror or error}") from None
+            raise StorageError(f"{self._folder}: {reason_of(error)}") from None
 
     def _reason(self, error: sqlite3.Error) -> str:
         if getattr(error, "sqlite_errorcode", 0) & 0xFF in LOCKED:

@@ -443,6 +443,13 @@ def test_copy_takes_the_shipped_name_and_overwrites_nothing(call: Call) -> None:
     assert left() == ["f1.yaml", "measured-boundary.csv"]
 
 
+def test_copy_completes_that_of_a_killed_call(call: Call) -> None:
+    copy = ["init", "--from", "modelling/measured-boundary"]
+    assert call(*copy).code == 0
+    Path("measured-boundary.yaml").unlink()
+    assert call(*copy).code == 0
+
+
 def test_setup_can_be_plotted_before_the_run(call: Call) -> None:
     assert call("plot", "e.json", "--dpi", "50").out == "tensile-setup.png written\n"
     assert call("plot", "paper/a", "--set", "steps=3", "-o", "a.svg").out == "a.svg written\n"

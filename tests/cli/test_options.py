@@ -3,6 +3,7 @@ run."""
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
@@ -280,6 +281,45 @@ def test_out_of_memory_during_a_run_is_reported(error: str, capsys: Any, monkeyp
         main(["run"])
     assert caught.value.code == 6
     assert capsys.readouterr().err.startswith("pbdkit: out of memory")
+
+
+@pytest.mark.parametrize(
+    ("function", "command"),
+    [
+        ("pbdkit.linear.stencil._eigenvalues", ["run", "e.json", "-o", "new.nc"]),
+        ("pbdkit.io.open.open_sealed", ["plot", "out.nc"]),
+        ("pbdkit.cli.verify.open_sealed", ["verify", "out.nc"]),
+    ],
+)
+def test_exhausted_memory_has_no_other_effect(
+    function: str, command: list[str], call: Call, monkeypatch: Any
+) -> None:
+    """It neither counts as damage of a file, nor leaves anything out of a result."""
+
+    def raises(*_: Any, **more: Any) -> None:
+        raise MemoryError
+
+    assert call("run", "e.json", "-o", "out.nc").code == 0
+    monkeypatch.setattr(function, raises)
+    found = call(*command)
+    assert (found.code, found.err.startswith("pbdkit: out of memory")) == (6, True), found.err
+    assert left() == ["out.nc"]
+
+
+@pytest.mark.parametrize("name", ["e.json", "m.csv"])
+def test_disk_that_fails_while_an_input_is_read(name: str, call: Call, monkeypatch: Any) -> None:
+    opened = Path.open
+
+    def fails(path: Path, *mode: Any, **more: Any) -> Any:
+        if path.name == name:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        return opened(path, *mode, **more)
+
+    Path("m.csv").write_text("step,ux,uy\n0,0,0\n9,1,0\n")
+    motion = "leaders.1.motion={type: table, file: m.csv}"
+    monkeypatch.setattr(Path, "open", fails)
+    found = call("run", "e.json", "--set", motion, "-o", "out.nc")
+    assert (found.code, f"{name}: cannot be read: Input/output error; " in found.err) == (6, True)
 
 
 def test_container_limit_bounds_memory(tmp_path: Path, monkeypatch: Any) -> None:

@@ -216,7 +216,8 @@ def test_partial_project_is_removed(call: Call, monkeypatch: pytest.MonkeyPatch)
 
     monkeypatch.setattr(os, "fsync", full)
     result = call("plugins", "new", "pbdkit-mine")
-    message = "pbdkit: pbdkit-mine: cannot be written: No space left on device\n"
+    message = "pbdkit: pbdkit-mine: cannot be written: No space left on device; "
+    message += "free some space, and repeat the command\n"
     assert (result.code, result.err) == (6, message)
     assert [path.name for path in Path.cwd().iterdir()] == ["e.json"]
 

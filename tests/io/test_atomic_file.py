@@ -140,7 +140,8 @@ def test_a_sweep_on_a_full_disk_keeps_its_earlier_dataset(
         patch.setattr(io, "FileIO", Full)
         found = result(*sweep)
     assert (found.code, left()) == (6, [])
-    assert found.err == "pbdkit: s/sweep.nc: cannot be written: No space left on device\n"
+    full = "No space left on device; free some space, and repeat the command"
+    assert found.err == f"pbdkit: s/sweep.nc: cannot be written: {full}\n"
     assert Path("s/sweep.nc").read_bytes() == earlier
 
 
@@ -255,7 +256,7 @@ def test_too_few_descriptors_for_the_workers_are_named(result: Call) -> None:
 
 def test_failing_standard_output_is_named_and_no_bug(result: Call) -> None:
     listing, told = ["experiments"], "pbdkit: standard output: {}\n"
-    full = "No space left on device"
+    full = "No space left on device; free some space, and repeat the command"
     runs = ["run", "e.json", "-o", "out.nc", "--force"]
     cases = {
         ">/dev/full": (listing, 6, told.format(full)),

@@ -71,9 +71,9 @@ if FAULTS:
 SMALL = {
     "body": {"type": "grid", "columns": 5, "rows": 4},
     "steps": 3,
-    "diagnostics": [{"type": "broken"}],
+    "diagnostics": [{"type": "pe1"}],
 }
-SWEEP = {"vary": {"solver.relaxation": [0.5, 1.0]}, "keep": {"variables": ["broken"], "times": "last"}}
+SWEEP = {"vary": {"solver.relaxation": [0.5, 1.0]}, "keep": {"variables": ["pe1"], "times": "last"}}
 FIT = {
     "experiment": {
         "name": "plate",
@@ -341,16 +341,25 @@ def commands() -> dict[str, Command]:
     return found
 
 
+HEADS = "calls | trials | held | broken | crashes in a library"
+
+
 @dataclass
 class Outcome:
     """The trials of one command with one kind of fault."""
 
-    calls: int
+    calls: int = 0
     trials: int = 0
     broken: int = 0
     crashes: Counter[str] = field(default_factory=Counter)
     """Crashes in libraries without memory, by the library."""
     messages: Counter[str] = field(default_factory=Counter)
+
+    def row(self) -> str:
+        """Return a row of the table."""
+        held = self.trials - self.broken
+        numbers = (self.calls, self.trials, held, self.broken, self.crashes.total())
+        return " | ".join(map(str, numbers))
 
 
 class Bench:
@@ -392,39 +401,42 @@ class Bench:
         code = ended(started(work, self._log), 120.0)
         return code, self._log.read_text(errors="replace")
 
-    def tried(self, kind: str, first: int, every: int) -> Iterator[tuple[Outcome, list[str]]]:
-        """Carry out the trials; generate the present outcome and the findings of each."""
+    def tried(self, kind: str, first: int, every: int) -> Outcome:
+        """Carry out the trials, and print what does not hold."""
+        outcome = Outcome()
         states = self._power_cuts if kind in POWER_KINDS else self._faults
-        for outcome, number, code, said in states(kind, first, every):
+        for number, code, said in states(outcome, kind, first, every):
             outcome.trials += 1
             outcome.messages[said.strip()] += 1
             findings = list(self._judged(kind, code, said, outcome))
             outcome.broken += bool(findings)
-            yield outcome, [f"call {number} of {outcome.calls}: {text}" for text in findings]
+            for text in findings:
+                print(f"  {kind}, call {number} of {outcome.calls}: {text}", flush=True)
+        return outcome
 
     def _faults(
-        self, kind: str, first: int, every: int
-    ) -> Iterator[tuple[Outcome, int, int, str]]:
+        self, outcome: Outcome, kind: str, first: int, every: int
+    ) -> Iterator[tuple[int, int, str]]:
+        """Generate number, exit status and output of each trial."""
         self._fresh(self._folder)
         code, said = self._carried_out(kind, 0)
-        outcome = Outcome(FAULTS.faults_calls())
+        outcome.calls = FAULTS.faults_calls()
         assert code == 0, said
         for number in range(first, outcome.calls + 1, every):
             self._fresh(self._folder)
-            yield outcome, number, *self._carried_out(kind, number)
+            yield number, *self._carried_out(kind, number)
 
     def _power_cuts(
-        self, kind: str, first: int, every: int
-    ) -> Iterator[tuple[Outcome, int, int, str]]:
+        self, outcome: Outcome, kind: str, first: int, every: int
+    ) -> Iterator[tuple[int, int, str]]:
         """Repeat one recorded execution up to each call, and write what is on the disk then."""
         self._fresh(self._folder)
         disk = Disk(self._folder)
         code, said = self._carried_out("record", 0)
-        outcome = Outcome(FAULTS.faults_calls())
+        outcome.calls = FAULTS.faults_calls()
         assert code == 0, said
-        recorded = list(changes(self._record))
         whole = Disk(self._folder)
-        left = iter(recorded)
+        left = changes(self._record)
         change = next(left, None)
         os.chdir(self._root)
         for number in range(1, outcome.calls + 2):  # the last power cut is after the last call
@@ -439,7 +451,7 @@ class Bench:
             else:
                 disk.torn(self._folder, random.Random(number))
             os.chdir(self._folder)
-            yield outcome, number, 0 if number > outcome.calls else -signal.SIGKILL, ""
+            yield number, 0 if number > outcome.calls else -signal.SIGKILL, ""
             os.chdir(self._root)
         assert disk.content("-shm") == whole.content("-shm"), "the record is not complete"
 
@@ -554,30 +566,22 @@ def _main() -> None:
     asked.add_argument("--messages", action="store_true", help="print each message")
     given = asked.parse_args()
     _prepare_drawing()
-    known, broken, rows = commands(), 0, []
+    known, rows, trials, broken = commands(), list[str](), 0, 0
     kinds = _chosen(given.kind, KINDS)
     for name in _chosen(given.command, known):
         with tempfile.TemporaryDirectory(dir=MEMORY if MEMORY.is_dir() else None) as folder:
             bench = Bench(known[name], Path(folder).resolve(), given.least)
             for kind in kinds:
-                outcome = Outcome(0)
-                for outcome, findings in bench.tried(kind, given.first, given.every):
-                    for text in findings:
-                        print(f"  {name}, {kind}, {text}", flush=True)
-                for crash, count in outcome.crashes.items():
-                    print(f"  {name}, {kind}, {count} times {crash}", flush=True)
-                if given.messages:
-                    for text, count in outcome.messages.most_common():
-                        print(f"  {name}, {kind}, {count} times {text!r}", flush=True)
-                held = outcome.trials - outcome.broken
-                crashes = outcome.crashes.total()
-                rows.append((name, kind, outcome.calls, outcome.trials, held, outcome.broken, crashes))
-                print(*rows[-1], sep=" | ", flush=True)
-                broken += outcome.broken
+                outcome = bench.tried(kind, given.first, given.every)
+                listed = outcome.crashes + (outcome.messages if given.messages else Counter())
+                for text, times in listed.most_common():
+                    print(f"  {times} times {text!r}")
+                rows.append(f"{name} | {kind} | {outcome.row()}")
+                print(rows[-1], flush=True)
+                trials, broken = trials + outcome.trials, broken + outcome.broken
             os.chdir("/")
-    heads = ("command", "kind", "calls", "trials", "held", "broken", "crashes in a library")
-    print("", *(" | ".join(map(str, row)) for row in (heads, *rows)), sep="\n")
-    print(f"{sum(row[4] for row in rows)} of {sum(row[3] for row in rows)} held", flush=True)
+    print("", f"command | kind | {HEADS}", *rows, sep="\n")
+    print(f"{trials - broken} of {trials} held")
     raise SystemExit(broken > 0)
 
 

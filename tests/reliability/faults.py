@@ -172,9 +172,7 @@ class Disk:
         """Repeat a change."""
         node = self._by_inode.get(change.inode)
         if change.operation in (CREATE, MKDIR):
-            node = self._by_inode[change.inode] = (
-                File() if change.operation == CREATE else Folder()
-            )
+            node = self._by_inode[change.inode] = File() if change.operation == CREATE else Folder()
             entries, name = self._parent(change.path)
             entries[name] = node
         elif change.operation in (LINK, RENAME):

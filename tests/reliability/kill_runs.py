@@ -188,9 +188,7 @@ def main() -> None:
     raise SystemExit(failed > 0)
 
 
-def tried(
-    library: Any, seed: int, numbers: Any, kinds: list[str]
-) -> tuple[int, int, int, int]:
+def tried(library: Any, seed: int, numbers: Any, kinds: list[str]) -> tuple[int, int, int, int]:
     """Trials that found something, kills, records lost, runs unreadable."""
     failed = kills = lost = unreadable = 0
     here = Path.cwd()
