@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from pbdkit.errors import ExperimentError
-from pbdkit.io.atomic_file import write_together
+from pbdkit.io.atomic_file import remove_leftovers, write_together
 from pbdkit.model.shipped import (
     SUFFIX,
     shipped_data,
@@ -45,8 +45,11 @@ def init(file: Path | None, origin: str | None) -> None:
         raise ExperimentError(f"{path}: is the name of a shipped experiment, not a file; {copy}")
     data = shipped_data(origin) if origin else []
     tables = {path.with_name(d.name): d.read_bytes() for d in data}
-    # An earlier call that was killed may have written some of the tables.
-    files = {t: c for t, c in tables.items() if not _contains(t, c)} | {path: text.encode()}
+    for table, content in [*tables.items()]:
+        if _contains(table, content):  # An earlier call that was killed has written it.
+            remove_leftovers(table)
+            del tables[table]
+    files = tables | {path: text.encode()}
     for target in files:
         if os.path.lexists(target):
             raise ExperimentError(f"{target}: exists and is not replaced; name another file")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import click
 
 from pbdkit.errors import ExperimentError, StorageError, reason_of, refuse_no_matplotlib
-from pbdkit.io.atomic_file import kind_of, write
+from pbdkit.io.atomic_file import encoding, kind_of, write
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -92,7 +92,8 @@ def save(picture: Path, figure: Figure, *, replace: bool, quiet: bool = False) -
         If the file system returns an error.
     """
     content = io.BytesIO()
-    figure.savefig(content, format=picture.suffix.removeprefix("."))
+    with encoding(picture):
+        figure.savefig(content, format=picture.suffix.removeprefix("."))
     write(picture, content.getvalue(), replace=replace)
     if not quiet:
         click.echo(f"{picture} written")

@@ -112,6 +112,16 @@ def sync_folder(folder: Path) -> None:
             os.close(descriptor)
 
 
+def make_folder(folder: Path) -> None:
+    """Create a folder and its parents, unless they exist, so that they outlast a power cut. Raises
+    OSError."""
+    absolute = folder.absolute()
+    missing = [path for path in (absolute, *absolute.parents) if not path.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    for path in missing:
+        sync_folder(path.parent)
+
+
 class NewFile(io.RawIOBase):
     """File on the disk that records the first failed write instead of raising it.
 
@@ -325,6 +335,19 @@ def _refusing(path: Path) -> Iterator[None]:
         raise WriteError(f"{path}: cannot be written: {reason_of(error)}") from None
 
 
+@contextmanager
+def encoding(path: Path) -> Iterator[None]:
+    """Convert an OSError of the library that encodes a picture in the block to a WriteError. Pillow
+    raises it if memory is exhausted."""
+    try:
+        yield
+    except OSError as error:
+        raise WriteError(
+            f"{path}: cannot be written: {error.strerror or error}; memory may be exhausted: "
+            "reduce --dpi or --size"
+        ) from None
+
+
 def _hidden(name: str, random: str = "") -> str:
     """Return the name of a file under construction in the folder of the result."""
     return f".{_short(name)}.{random or secrets.token_hex(RANDOM_BYTES)}{TEMPORARY}"
@@ -335,6 +358,16 @@ def _short(name: str) -> str:
     while len(os.fsencode(name)) > NAME_BYTES:
         name = name[:-1]
     return name
+
+
+def remove_leftovers(path: Path) -> None:
+    """Remove the files under construction that killed processes left for a result."""
+    random = "[0-9a-f]" * 2 * RANDOM_BYTES
+    prefix, _, end = _hidden(path.name, "*").rpartition("*")
+    for leftover in path.parent.glob(f"{escape(prefix)}{random}{end}"):
+        with suppress(OSError), io.FileIO(leftover, "r+b") as file:
+            if lock(file):
+                leftover.unlink()
 
 
 class Destination:
@@ -354,12 +387,7 @@ class Destination:
     def temporary(self) -> io.FileIO:
         """Create and lock a file with a unique name in the folder of the result. Remove files with
         such names that remain from killed runs. Raises OSError."""
-        random = "[0-9a-f]" * 2 * RANDOM_BYTES
-        prefix, _, end = _hidden(self.path.name, "*").rpartition("*")
-        for leftover in self._folder.glob(f"{escape(prefix)}{random}{end}"):
-            with suppress(OSError), io.FileIO(leftover, "r+b") as file:
-                if lock(file):
-                    leftover.unlink()
+        remove_leftovers(self._folder / self.path.name)
         while True:
             file = io.FileIO(self._folder / _hidden(self.path.name), "x+b")
             if lock(file) and os.fstat(file.fileno()).st_nlink:

@@ -638,9 +638,11 @@ class UnfinishedRun:
                 if kind.kind not in "fiub" or np.prod(shape, dtype=float) > MAX_ARRAY_ENTRIES:
                     raise ValueError(dtype)
                 stored = StoredArray(self._store, ARRAYS + name, kind, tuple(shape))
+                if len(self._store.keys(f"{ARRAYS}{name}/")) != -(-stored.nbytes // PART_BYTES):
+                    raise ValueError(f"'{name}' has another size")
                 waits = not on_disk or name.startswith("waiting.")
                 arrays[name] = np.asarray(stored) if waits else stored
-        except (KeyError, TypeError, ValueError, MemoryError) as error:
+        except (KeyError, TypeError, ValueError) as error:
             raise StorageError(f"{self._store.path}: is damaged: {error}") from None
         self._arrays = {*self._store.keys(ARRAYS)}
         return Checkpoint(self.about, facts, arrays)

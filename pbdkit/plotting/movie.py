@@ -20,7 +20,7 @@ from pbdkit.errors import (
     refuse_no_matplotlib,
     refuse_without,
 )
-from pbdkit.io.atomic_file import NewFile, open_atomic
+from pbdkit.io.atomic_file import NewFile, encoding, open_atomic
 from pbdkit.io.layout import as_step
 from pbdkit.plotting.data import Extent, Snapshot, Trajectory, extent_of
 from pbdkit.plotting.style import Limits, Norm, PlotOptions
@@ -155,7 +155,8 @@ def animate(
     with open_atomic(path, NewFile, replace=replace) as new:
         if path.suffix == ".gif":
             few = moving.frames(rows[:: max(1, len(rows) // 4)])
-            _write_gif(new, np.concatenate([*few]), frames, fps)
+            with encoding(path):
+                _write_gif(new, np.concatenate([*few]), frames, fps)
         else:
             _write_mp4(new, frames, fps)
 

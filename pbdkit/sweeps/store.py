@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from pbdkit.errors import StorageError, reason_of
-from pbdkit.io.atomic_file import FULL, is_full, lock, sync_folder
+from pbdkit.io.atomic_file import FULL, is_full, lock, make_folder, sync_folder
 from pbdkit.io.sqlite_file import (
     BEGINNING,
     ONE_PAGE,
@@ -105,6 +105,7 @@ class Store:
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._path, self._closing = folder, folder / DATABASE, ExitStack()
+        self._place: os.stat_result | None = None
         self._keys: set[str] = set()
         self._due = time.monotonic() + COMMIT_S
         self.faults: list[str] = []
@@ -112,7 +113,7 @@ class Store:
     def __enter__(self) -> Self:
         """Create the folder, lock it, and open the database."""
         with self._report_errors():
-            self._folder.mkdir(parents=True, exist_ok=True)
+            make_folder(self._folder)
             self._place = self._folder.stat()
             self._lock = self._closing.enter_context(_locked(self._folder / LOCK))
         try:
@@ -226,6 +227,8 @@ class Store:
             )
 
     def _refuse_moved(self) -> None:
+        if self._place is None:  # The folder could not be created.
+            return
         try:
             exists = os.path.samestat(self._folder.stat(), self._place)
         except OSError:
@@ -258,7 +261,7 @@ class Store:
     def _write(self, report: MemberReport) -> None:
         """Write a report to a file with a name that no other process uses, and rename the file."""
         path = self._file(report.key)
-        path.parent.mkdir(exist_ok=True)
+        make_folder(path.parent)
         temporary = path.with_name(f".{socket.gethostname()}.{os.getpid()}.{uuid.uuid4().hex}")
         try:
             with temporary.open("xb") as file:
@@ -266,6 +269,7 @@ class Store:
                 file.flush()
                 os.fsync(file.fileno())
             temporary.replace(path)
+            sync_folder(path.parent)
         except BaseException:
             temporary.unlink(missing_ok=True)
             raise
@@ -286,8 +290,9 @@ class Store:
         The database is renamed to its final name when it is complete.
         """
         new, count = self._folder / NEW, self._member_count()
-        if new.exists() and not self._path.exists():  # A sweep was killed between both renames.
-            new.replace(self._path)
+        has_journal = any(path.exists() for path in files_of(new)[1:])  # It is incomplete then.
+        if new.exists() and not has_journal and not self._path.exists():
+            new.replace(self._path)  # A sweep was killed between both renames.
         fault = self._fault(count)
         if fault is None:
             return

@@ -446,8 +446,9 @@ def test_copy_takes_the_shipped_name_and_overwrites_nothing(call: Call) -> None:
 def test_copy_completes_that_of_a_killed_call(call: Call) -> None:
     copy = ["init", "--from", "modelling/measured-boundary"]
     assert call(*copy).code == 0
-    Path("measured-boundary.yaml").unlink()
+    Path("measured-boundary.yaml").rename(f".measured-boundary.csv.{'0' * 16}.partial")
     assert call(*copy).code == 0
+    assert left() == ["measured-boundary.csv", "measured-boundary.yaml"]
 
 
 def test_setup_can_be_plotted_before_the_run(call: Call) -> None:

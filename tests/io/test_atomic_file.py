@@ -17,9 +17,11 @@ import numpy as np
 import pytest
 
 import pbdkit
+from pbdkit.io import atomic_file
 from pbdkit.io.atomic_file import NewFile, open_atomic, write, write_folder, write_together
 from pbdkit.io.paged_file import PagedFile
 from pbdkit.io.seal import SealedFile
+from pbdkit.sweeps import store
 from tests.conftest import Call
 
 SCRIPT = Path(__file__).parents[1] / "reliability" / "disk_faults.py"
@@ -273,13 +275,61 @@ def test_failing_standard_output_is_named_and_no_bug(result: Call) -> None:
     assert sealed(Path("out.nc"))
 
 
+def test_a_database_with_a_journal_is_created_again(result: Call) -> None:
+    """The sweep was killed, or the disk failed, while the database was created."""
+    Path("s").mkdir()
+    for suffix in ("", "-journal"):
+        Path(f"s/sweep.sqlite.new{suffix}").write_bytes(b"incomplete")
+    assert result("sweep", "s.json", "-o", "s", "--workers", "1").code == 0
+    assert sorted(p.name for p in Path("s").iterdir()) == ["lock", "sweep.nc", "sweep.sqlite"]
+
+
+def test_a_folder_that_cannot_be_created_was_not_moved(
+    result: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: Any, **more: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Path, "mkdir", full)
+    found = result("sweep", "s.json", "-o", "s", "--workers", "1")
+    assert found.err.startswith("pbdkit: s: No space left on device; ")
+
+
+def test_new_folders_of_a_sweep_outlast_a_power_cut(
+    result: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    synced = set[Path]()
+    for module in (atomic_file, store):
+        monkeypatch.setattr(module, "sync_folder", lambda folder: synced.add(folder.absolute()))
+    monkeypatch.setattr(store, "LARGE_BYTES", 0)
+    assert result("sweep", "s.json", "-o", "of/s", "--workers", "1").code == 0
+    here = Path.cwd()
+    assert synced >= {here, here / "of", here / "of" / "s", here / "of" / "s" / "members"}
+
+
+def test_picture_that_cannot_be_encoded_blames_no_file_that_is_read(
+    result: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pillow raises this error if memory is exhausted."""
+
+    def exhausted(*_: Any, **more: Any) -> None:
+        raise OSError("codec configuration error")
+
+    monkeypatch.setattr("PIL.Image.Image.save", exhausted)
+    for words in (["plot", "in.nc", "-o", "o.png"], ["animate", "in.nc", "-o", "o.gif"]):
+        found = result(*words)
+        assert (found.code, left()) == (6, [])
+        assert f"{words[-1]}: cannot be written: codec configuration error; " in found.err
+
+
 def test_sample_of_disk_faults() -> None:
     """The script tries each call of each command; tests/reliability/disk_faults.py."""
-    some = ["--commands", "run,export vtkhdf,init", "--first", "2", "--every", "200"]
+    some = ["--command", "run,init --from", "--kind", "eio,kill,torn,block"]
+    some += ["--first", "5", "--every", "15"]
     done = subprocess.run(
         [sys.executable, str(SCRIPT), *some], capture_output=True, text=True, check=False
     )
     if done.returncode == 77:
         pytest.skip(done.stdout.strip())
     assert done.returncode == 0, done.stdout + done.stderr
-    assert " 0 of 0 held" not in done.stdout
+    assert "\n0 of 0 held" not in done.stdout

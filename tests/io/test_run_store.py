@@ -55,6 +55,8 @@ def test_a_sample_of_the_long_trials(
         status = import_module(sys.argv[0]).main()
     except SystemExit as ended:
         status = ended.code
+    if status == 77:
+        pytest.skip("needs a C compiler")
     assert status in (0, False), capsys.readouterr().out
 
 
