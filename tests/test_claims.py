@@ -10,7 +10,7 @@ from reliability import nightly
 
 TESTS = Path(__file__).parent
 SHARED = {
-    "damage", "hostile_text", "isolation", "nightly", "stopping", "trials",
+    "damage", "faults", "hostile_text", "isolation", "nightly", "stopping", "trials",
 }  # fmt: skip
 """Modules of tests/reliability that other scripts use."""
 

@@ -253,7 +253,7 @@ def _lengthened() -> list[str]:
 
 
 def _on_network(begin: Callable[[], object] = lambda: None) -> Callable[[], None]:
-    """As on a disk of another machine, where SQLite has a journal."""
+    """Begin on a disk of another machine, where SQLite has a journal."""
 
     def before() -> None:
         begin()

@@ -169,7 +169,7 @@ class Disk:
         return folder.entries, name
 
     def repeat(self, change: Change) -> None:
-        """Repeat a change."""
+        """Apply a recorded change to the model."""
         node = self._by_inode.get(change.inode)
         if change.operation in (CREATE, MKDIR):
             node = self._by_inode[change.inode] = File() if change.operation == CREATE else Folder()
@@ -201,8 +201,8 @@ class Disk:
         _put(self.root, folder, lambda folder: folder.entries, lambda file: file.torn(draw))
 
     def content(self, unseen: str) -> dict[str, bytes | None]:
-        """Return the present contents by path; those of files that are written through memory,
-        whose names end in `unseen`, are empty."""
+        """Return the present contents by path. Files that are written through memory, with names
+        that end in `unseen`, count as empty."""
         return dict(_contents(self.root, "", unseen))
 
 
