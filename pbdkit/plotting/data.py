@@ -135,9 +135,9 @@ def whole(cells: Array, pairs: Array, particles: int) -> Array:
     touched = np.zeros(particles, np.bool_)
     touched[pairs] = True
     near = np.flatnonzero(touched[cells].sum(axis=1) >= 2)
-    broken = np.unique(_codes(pairs, particles))
+    broken = np.unique(pair_codes(pairs, particles))
     ends = [(0, 1), (1, 2), (2, 3), (3, 0), (0, 2), (1, 3)]
-    sides = np.stack([_codes(cells[near][:, end], particles) for end in ends], axis=1)
+    sides = np.stack([pair_codes(cells[near][:, end], particles) for end in ends], axis=1)
     intact[near[np.isin(sides, broken).any(axis=1)]] = False
     return intact
 
@@ -146,14 +146,14 @@ def outline(cells: Array, particles: int) -> Array:
     """Return the sides that belong to only one cell, as pairs of rows, (side, 2)."""
     sides = np.concatenate([cells[:, [k, (k + 1) % 4]] for k in range(4)])
     sides = sides[sides[:, 0] != sides[:, 1]]
-    codes, counts = np.unique(_codes(sides, particles), return_counts=True)
+    codes, counts = np.unique(pair_codes(sides, particles), return_counts=True)
     return np.stack(np.divmod(codes[counts == 1], particles), axis=1)
 
 
-def _codes(pairs: Array, particles: int) -> Array:
+def pair_codes(pairs: Array, particles: int) -> Array:
     """Return a number for each pair. It does not depend on the order of the pair."""
-    low, high = np.sort(pairs.astype(np.int64), axis=1).T
-    return np.asarray(low * particles + high)
+    first, second = pairs.astype(np.int64).T
+    return np.asarray(np.minimum(first, second) * particles + np.maximum(first, second))
 
 
 PARTS = 8
@@ -198,6 +198,11 @@ class CutCells:
 
     row: Array
     distance: Array
+
+    @property
+    def parts(self) -> int:
+        """Return the number of parts of each side of a cell."""
+        return int(self.distance.shape[1]) - 1
 
     @classmethod
     def of(cls, shape: Shape, cells: Array, reference: Array, outside: Array) -> CutCells:
@@ -269,9 +274,13 @@ def _along_cells(shape: Shape, sides: Array) -> Array:
 
 def between(corners: Array, along: Array) -> Array:
     """Return the places (cell, v, u, axis) between the corners (cell, 4, axis) of cells."""
+    return np.asarray(np.einsum("vuk,cka->cvua", corner_weights(along), corners))
+
+
+def corner_weights(along: Array) -> Array:
+    """Return the weights (v, u, corner) of the four corners of a cell at places along its sides."""
     u, v = np.meshgrid(along, along)
-    weights = np.stack([(1 - u) * (1 - v), u * (1 - v), u * v, (1 - u) * v], axis=-1)
-    return np.asarray(np.einsum("vuk,cka->cvua", weights, corners))
+    return np.stack([(1 - u) * (1 - v), u * (1 - v), u * v, (1 - u) * v], axis=-1)
 
 
 def distance_from(shape: Shape, at: Array) -> Array:

@@ -12,10 +12,12 @@ import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.colors import ListedColormap, Normalize
+from matplotlib.path import Path
 
 from pbdkit.array_types import Array
 from pbdkit.plotting.colours import OF_KINDS, Palette, Scale
 from pbdkit.plotting.data import CutCells, ReferenceBody, Snapshot
+from pbdkit.plotting.outline_path import OutlinePath
 from pbdkit.plotting.style import figure_of
 
 if TYPE_CHECKING:
@@ -45,6 +47,14 @@ class PixelGrid:
         xmin, xmax, ymin, ymax = self.box
         scale = np.array([self.across / (xmax - xmin), self.up / (ymax - ymin)], np.float32)
         return np.asarray((position - np.array([xmin, ymin])).astype(np.float32) * scale)
+
+    def pixel(self, place: Array) -> Array:
+        """Return the corners of the pixel that contains a place."""
+        xmin, xmax, ymin, ymax = self.box
+        size = np.array([(xmax - xmin) / self.across, (ymax - ymin) / self.up])
+        low = np.floor((place - np.array([xmin, ymin])) / size)
+        square = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]])
+        return np.asarray([xmin, ymin] + size * (low + square))
 
     def mean(self, corners: Array, values: Array, cut: OutlineCut | None = None) -> Array:
         """Return an array of shape (up, across) with the values at the pixels. They are
@@ -166,8 +176,8 @@ class Layer(ABC):
 
 
 class PixelField(Layer):
-    """A quantity of particles. It is drawn as pixels on the cells that have no broken bond, up to
-    the outline.
+    """A quantity of particles. It is drawn as pixels on the cells that have no broken bond, and
+    clipped to the outline of these cells.
 
     Particles outside these cells are drawn as dots with a size in points, or as single pixels if
     dots would be invisible. A corner outside the outline may have no value; it receives the mean
@@ -177,8 +187,9 @@ class PixelField(Layer):
     def __init__(
         self, ax: Axes, body: ReferenceBody, grid: PixelGrid, scale: Scale, size: float
     ) -> None:
-        self._body, self._grid = body, grid
+        self._body, self._grid, self._size = body, grid, size
         self._image = _image(ax, grid, scale)
+        self._outline: tuple[Array, OutlinePath] | None = None
         self._alone = ax.scatter(
             [], [], size**2, zorder=2, edgecolors=DOT_COLOUR, linewidths=0.08 * size
         )
@@ -198,7 +209,34 @@ class PixelField(Layer):
         self._alone.set_array(snapshot.values[alone])
         cells = _with(body.cells[chosen], alone)
         corners, cut = self._grid.places(snapshot.position)[cells], _cut(body, chosen, len(alone))
-        self._image.set_data(self._grid.mean(corners, values[cells], cut))
+        pixels = self._grid.mean(corners, values[cells], cut)
+        path = self._clip_path(chosen, snapshot.position, corners[: len(chosen)], alone)
+        if path is not None:
+            pixels = _beyond_edges(pixels)
+            self._image.set_clip_path(path, self._image.axes.transData)
+        else:
+            self._image.set_clip_path(self._image.axes.patch)
+        self._image.set_data(pixels)
+
+    def _clip_path(
+        self, chosen: Array, position: Array, corners: Array, alone: Array
+    ) -> Path | None:
+        """Return the outline of the chosen cells and of the pixels of particles outside cells.
+        Return None if cells are inverted, because then the outline may cancel."""
+        if not len(chosen) or not np.isfinite(corners).all() or _are_inverted(corners):
+            return None
+        if self._outline is None or not np.array_equal(self._outline[0], chosen):
+            body = self._body
+            rows = body.cut.row[chosen] if body.cut else np.full(len(chosen), -1)
+            self._outline = (
+                chosen,
+                OutlinePath.of(body.cells[chosen], body.cut, rows, body.reference),
+            )
+        path = self._outline[1].path(position)
+        if not len(alone) or self._size:
+            return path
+        squares = [self._grid.pixel(place) for place in position[alone]]
+        return Path.make_compound_path(path, *map(Path, squares))
 
 
 class BondField(Layer):
@@ -353,6 +391,33 @@ def _image(ax: Axes, grid: PixelGrid, scale: Scale) -> AxesImage:
         norm=scale.norm, extent=grid.box, origin="lower", aspect="equal", zorder=0,
         interpolation_stage="data",
     )  # fmt: skip
+
+
+BEYOND = 3
+"""Number of pixels by which a field is continued beyond its outline before it is clipped."""
+
+
+def _beyond_edges(pixels: Array) -> Array:
+    """Return pixels, (up, across), in which empty pixels near others have the mean of their
+    neighbours."""
+    for _ in range(BEYOND):
+        padded = np.pad(pixels, 1, constant_values=np.nan)
+        finite = np.isfinite(padded)
+        near = finite[:, :-2] | finite[:, 1:-1] | finite[:, 2:]
+        near = near[:-2] | near[1:-1] | near[2:]
+        up, across = np.nonzero(near & ~finite[1:-1, 1:-1])
+        around = np.stack([padded[up + v, across + u] for v in range(3) for u in range(3)])
+        pixels[up, across] = np.nanmean(around, axis=0)
+    return pixels
+
+
+def _are_inverted(corners: Array) -> bool:
+    """Return whether cells, (cell, 4, axis), have areas of both signs."""
+    first, second = corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]
+    triangles = (corners[:, 2] == corners[:, 3]).all(axis=1)
+    second = np.where(triangles[:, None], corners[:, 2] - corners[:, 1], second)
+    area = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
+    return bool(area.min() < 0.0 < area.max())
 
 
 def _filled(values: Array, cells: Array, outside: Array) -> Array:

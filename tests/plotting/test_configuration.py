@@ -5,7 +5,7 @@ import re
 from dataclasses import fields
 from inspect import Parameter, signature
 from itertools import combinations
-from pathlib import Path
+from pathlib import Path as FilePath
 
 import numpy as np
 import pytest
@@ -18,10 +18,11 @@ pytest.importorskip("matplotlib")
 
 from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.figure import Figure
+from matplotlib.path import Path
 from matplotlib.text import Text
 
 from pbdkit.plotting import animate, animation, compare, plot
-from pbdkit.plotting.data import cells_of, distance_from, outline, whole
+from pbdkit.plotting.data import Trajectory, cells_of, distance_from, outline, whole
 from pbdkit.plotting.layers import PixelGrid
 from pbdkit.plotting.style import PlotOptions
 
@@ -432,7 +433,11 @@ def test_fields_end_at_the_deformed_outline(name):
     shape = pbdkit.Experiment(**PLAIN | {"body": body}).body
     distance = distance_from(shape, at)
     clear = np.abs(distance) > 4 * pixel  # the distance of a dogbone is along y
-    np.testing.assert_array_equal(np.isfinite(image)[clear], distance[clear] < 0)
+    places = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    loops = [Path(corners).contains_points(places) for corners in clip_of(ax).to_polygons()]
+    inside = np.logical_xor.reduce(loops)
+    drawn = np.isfinite(image) & inside.reshape(image.shape)
+    np.testing.assert_array_equal(drawn[clear], distance[clear] < 0)
     shown = clear & (distance < 0)
     np.testing.assert_allclose(image[shown], at[shown][:, 0], atol=3 * pixel)
     assert (~clear).mean() < 0.1
@@ -597,7 +602,55 @@ def test_plots_share_documented_keyword_options(verb):
     assert {n: p.annotation for n, p in parameters.items() if n in options} == options
     assert all(parameters[name].kind is Parameter.KEYWORD_ONLY for name in options)
     assert all(p.kind is not Parameter.VAR_KEYWORD for p in parameters.values())
-    page = (Path(__file__).parents[2] / "docs" / "pictures.md").read_text()
+    page = (FilePath(__file__).parents[2] / "docs" / "pictures.md").read_text()
     assert not [name for name in options if f"--{name}" not in page and f"{name}=" not in page]
     sections = re.findall(r"^    ([a-z, ]+) : ", plot.__doc__, re.M)
     assert not {*options} - {name for names in sections for name in names.split(", ")}
+
+
+def clip_of(ax):
+    """The line to which the field is clipped, in the coordinates of the axes."""
+    return image_of(ax).get_clip_path().get_transformed_path_and_affine()[0]
+
+
+def area_of(path):
+    return sum(
+        0.5 * (p[:-1, 0] * p[1:, 1] - p[1:, 0] * p[:-1, 1]).sum()
+        for p in path.to_polygons(closed_only=True)
+    )
+
+
+AREAS = {
+    "hole": 12.3 * 8.0 - np.pi * 2.3**2,
+    "notch": 12.3 * 8.0 - 0.5 * 2.4 * (5.3 / 6.3) * 5.3,
+}
+
+
+@pytest.mark.parametrize("name", AREAS)
+def test_the_clipped_field_has_the_area_of_the_deformed_outline(name):
+    ds, body = cut_body(name)
+    moved, back = bent(ds.reference.values)
+    ds = ds.isel(time=[0]).assign(position=ds.position.isel(time=[0]).copy(data=moved[None]))
+    clip = clip_of(plot(ds, "reference_x", filled=True))
+    determinant = 1.3 * 0.9 + 0.25 * 0.35
+    assert area_of(clip) == pytest.approx(determinant * AREAS[name], rel=0.005)
+    shape = pbdkit.Experiment(**PLAIN | {"body": body}).body
+    assert distance_from(shape, back(clip.vertices)).max() < 0.05  # at the tip of the notch
+
+
+def test_cracks_are_gaps_of_the_clipped_field_and_inverted_cells_are_not_clipped(torn):
+    recording = Trajectory(torn, "pe1")
+    (snapshot,) = recording.snapshots([recording.row(8)])
+    body = recording.body
+    corners = snapshot.position[body.cells[body.whole_cells(body.cells, snapshot.broken)]]
+    (x, y), (x_next, y_next) = corners.T, np.roll(corners, -1, axis=1).T
+    area = 0.5 * (x * y_next - x_next * y).sum()
+    assert area_of(clip_of(plot(torn, "pe1", 8, filled=True))) == pytest.approx(area)
+    first = torn.isel(time=[0])
+    position = first.position.values.copy()
+    position[0, first.role.values == 0] *= np.linspace(1.0, 9.0, (first.role.values == 0).sum())[
+        :, None
+    ]
+    position[0, 60] -= [6.0, 0.0]
+    ax = plot(first.assign(position=first.position.copy(data=position)), "pe1", filled=True)
+    assert image_of(ax).get_clip_path() is None
