@@ -17,6 +17,8 @@ import argparse
 import collections
 import json
 import re
+import resource
+import signal
 import sys
 import traceback
 from itertools import combinations
@@ -40,8 +42,20 @@ import pbdkit
 
 ENDS = "is loaded, but not constrained"
 """A part that comes off a torn body cannot rest: a scene may end in this message."""
+PATIENCE_S = 60
+"""Processor time of one law on one scene."""
+MEMORY = 4 << 30
+"""Address space of the trial in bytes."""
 MOST_RETRIES = 400
 """Number of scenes with little besides one pair."""
+
+
+class TooLongError(Exception):
+    """A law took more than its processor time."""
+
+
+def _interrupt(*_: object) -> None:
+    raise TooLongError(f"not finished after {PATIENCE_S} s")
 
 
 class Trial:
@@ -58,6 +72,7 @@ class Trial:
         tree = experiment_of(features, number)
         faults: Faults = []
         for law in self.laws:
+            signal.setitimer(signal.ITIMER_VIRTUAL, PATIENCE_S)
             try:
                 found = LAWS[law](tree, number)
             except pbdkit.ExperimentError as error:
@@ -67,6 +82,8 @@ class Trial:
                 return
             except Exception:
                 found = [traceback.format_exc(limit=-3)]
+            finally:
+                signal.setitimer(signal.ITIMER_VIRTUAL, 0)
             self.outcomes[f"{law}: {'broken' if found else 'held'}"] += 1
             faults += [f"{law}: {fault}" for fault in found]
         if faults:
@@ -102,6 +119,8 @@ def main() -> int:
     parser.add_argument("--law", choices=LAWS, nargs="*", default=list(LAWS))
     parser.add_argument("--list", action="store_true", help="list the pairs that never meet")
     asked = parser.parse_args()
+    signal.signal(signal.SIGVTALRM, _interrupt)
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     trial, (first, every) = Trial(asked.law), asked.part
     scenes = list(covering(asked.seed))
     for n in range(first, len(scenes), every):
