@@ -932,7 +932,7 @@ def refusing(pair: Iterable[str]) -> str | None:
     """Return the message with which a pair is refused; None if it is not."""
     try:
         scene = build_scene(experiment_from(experiment_of(pair)))
-        if {*pair} & {*AUTO, "solver: equilibrium"}:
+        if {*pair} & {*AUTO} or not scene.experiment.solver.makes_steps:
             pbdkit.run(scene.experiment, progress=False)
     except pbdkit.ExperimentError as error:
         return str(error)
