@@ -111,6 +111,8 @@ SLIPS: tuple[tuple[type[Exception], str, str], ...] = (
      "use functions of numpy, as `numpy.sqrt`, in place of those of `math`"),
     (TypeError, "'numpy.ndarray' object is not callable",
      "a table is evaluated by `interpolate(x, p.name)`"),
+    (AttributeError, "can't set attribute",
+     "components of a vector cannot be set; make a new one, as `Vector(0.5 * v.x, v.y)`"),
 )  # fmt: skip
 """Frequent errors in elementwise functions: type, words of the message, and remedy."""
 
@@ -154,13 +156,11 @@ def remedy(error: BaseException, component: type[Any] | None = None) -> str:
     of_none = isinstance(error, AttributeError | TypeError) and "'NoneType'" in str(error)
     if of_none and not getattr(component, "uses_reference", True):
         return f"; {NO_REFERENCE}"
+    for slip, words, advice in SLIPS:
+        if isinstance(error, slip) and words in str(error):
+            return f"; {advice}"
     if not isinstance(error, AttributeError):
-        slips = (
-            f"; {advice}"
-            for kind, words, advice in SLIPS
-            if isinstance(error, kind) and words in str(error)
-        )
-        return next(slips, "")
+        return ""
     name, kind = str(error.name), type(error.obj).__name__
     if kind in ("Vector", "SpaceVector"):
         return f"; vectors have the components {', '.join(vars(type(error.obj))['_fields'])}"

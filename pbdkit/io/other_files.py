@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pbdkit.errors import ExperimentError
+from pbdkit.errors import ExperimentError, StorageError
 from pbdkit.io.run_store import STORE
 from pbdkit.model.reading import EXPERIMENT, command_for, kind_of, read_file
 from pbdkit.model.shipped import shipped_names
@@ -18,7 +18,10 @@ FAULTY = "faulty"
 
 
 def refuse_other_file(path: Path) -> None:
-    """Raise ExperimentError if a path leads to a file that is certainly not a result."""
+    """Raise ExperimentError if a path leads to a file that is certainly not a result, and
+    StorageError if there is not even its folder."""
+    if not path.parent.is_dir():
+        raise StorageError(f"{path}: there is no such file")
     if description := other_file(path):
         raise ExperimentError(f"{path}: {description}")
 

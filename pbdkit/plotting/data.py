@@ -404,6 +404,11 @@ def refuse_color(
             f"'{name}' was not recorded; add {' or '.join(makers)} to `diagnostics`, and run the "
             f"experiment again; drawable: {', '.join(names)}"
         )
+    if name == "kind":
+        raise ExperimentError(
+            "the kinds of particles, which are drawn by default, were not recorded; select a "
+            f"variable with --color, in Python with color=: {', '.join(names)}"
+        )
     vectors = [n for n in (*names, *drawable) if "axis" in dataset[n].dims]
     parts = [f"{n}_{axis}" for n in vectors for axis in axes]
     suggestion = did_you_mean(name, [*drawable, *parts]) or ";"
@@ -664,20 +669,21 @@ def of_one_run(dataset: xarray.Dataset) -> xarray.Dataset:
 
 
 def _with_positions(dataset: xarray.Dataset) -> xarray.Dataset:
-    """Return the dataset with positions. If positions were not recorded, the positions at rest are
-    used. Raises ExperimentError if these are missing, too."""
-    if "position" in dataset.variables:
-        return dataset
-    if "reference" not in dataset.variables or "role" not in dataset.variables:
-        raise ExperimentError("there are no positions to draw; keep the variable `position`")
-    unknown = np.where(dataset["role"] == OF_BODY, UNKNOWN, FRAME)
-    added = {"position": dataset["reference"]}
-    if "kind" not in dataset.variables:
+    """Return the dataset with positions and kinds. If positions were not recorded, the positions at
+    rest are used. Raises ExperimentError if these are missing, too."""
+    added = {}
+    if "kind" not in dataset.variables and "role" in dataset.variables:
+        unknown = np.where(dataset["role"] == OF_BODY, UNKNOWN, FRAME)
         added["kind"] = dataset["role"].copy(data=unknown)
+    if "position" not in dataset.variables:
+        if "reference" not in dataset.variables or "role" not in dataset.variables:
+            raise ExperimentError("there are no positions to draw; keep the variable `position`")
+        added["position"] = dataset["reference"]
+        title = f"{dataset.attrs.get('title', '')}, drawn at rest"
+        dataset = dataset.assign_attrs(title=title)
     if "time" in dataset.dims:
         added = {name: values.expand_dims(time=dataset["time"]) for name, values in added.items()}
-    title = f"{dataset.attrs.get('title', '')}, drawn at rest"
-    return dataset.assign(added).assign_attrs(title=title)
+    return dataset.assign(added)
 
 
 Box = tuple[float, float, float, float]

@@ -304,7 +304,8 @@ class Dots(Layer):
         palette = self._colours if isinstance(self._colours, Palette) else OF_KINDS
         ranks = palette.ranks(snapshot)
         order = np.argsort(ranks, kind="stable")
-        order = order[np.isfinite(ranks[order]) & ~self._hidden[order]]
+        has_colour = np.isfinite(ranks) | (palette is not self._colours)
+        order = order[has_colour[order] & ~self._hidden[order]]
         self._dots.set_offsets(snapshot.position[order])
         if isinstance(self._colours, Scale):
             assert snapshot.values is not None

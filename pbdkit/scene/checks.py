@@ -226,8 +226,8 @@ def far_from_the_body(experiment: Experiment, raster: Raster) -> Iterator[str]:
         number, at_x, at_y = raster.communicator.first(nearest)
         yield (
             f"{name}.select.nearest: the distance of ({x:g}, {y:g}) from the body is "
-            f"{math.hypot(x - at_x, y - at_y):.4g}; the nearest particle is {number}, at "
-            f"({at_x:.6g}, {at_y:.6g})"
+            f"{math.hypot(x - at_x, y - at_y):.4g} lattice units; the nearest particle is "
+            f"{number}, at ({at_x:.6g}, {at_y:.6g})"
         )
 
 

@@ -642,8 +642,8 @@ def _refuse_body_inside(raster: Raster, outline: Outline, n: int) -> None:
         x, y = raster.reference(rows[worst : worst + 1])[0]
         raise ExperimentError(
             f"particle {rows[worst] + 1} at ({x:.6g}, {y:.6g}) starts at a depth of "
-            f"{-gap[worst]:.3g} inside it; start the obstacle outside the body and move it there, "
-            "or start it at a later step",
+            f"{-gap[worst]:.3g} lattice units inside it; start the obstacle outside the body and "
+            "move it there, or start it at a later step",
             ("obstacles", n, "shape"),
         )
 

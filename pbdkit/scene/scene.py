@@ -35,6 +35,7 @@ from pbdkit.lattice.neighbourhood import (
     setting_of,
 )
 from pbdkit.lattice.raster import OmittedCells, Raster, Restriction, RowLayout, RowRange, distinct
+from pbdkit.model.bodies import Difference
 from pbdkit.model.experiment import Experiment
 from pbdkit.plugin import (
     AppliesTwice,
@@ -157,12 +158,14 @@ class LatticeSetup:
 
     def nothing(self) -> ExperimentError:
         """Return the error for a body without particles."""
-        text = "contains no site of the lattice; enlarge it, or move it"
-        if self.experiment.frame.weighs_cells:
-            text = (
-                "contains no cell of the lattice; enlarge it, or use a frame that does not weight "
-                "cells"
-            )
+        frame, body = self.experiment.frame, self.experiment.body
+        text = f"contains no {'cell' if frame.weighs_cells else 'site'} of the lattice; "
+        if isinstance(body, Difference):
+            text += "make the parts that are subtracted smaller, or the first part larger"
+        else:
+            text += "enlarge it, or move it"
+        if frame.weighs_cells:
+            text += ", or use a frame that does not weight cells"
         return ExperimentError(text, ("body",))
 
     def _refuse_without_cells(self) -> None:

@@ -108,7 +108,7 @@ class Selecting:
             rows = self.nearest(selection.nearest or ())
         if not self.raster.communicator.any(len(rows)):
             low, high = (np.round(f(self._x, axis=0), 6).tolist() for f in (np.min, np.max))
-            text = f"selects no particle; the body extends from {low} to {high}"
+            text = f"selects no particle; the body extends from {low} to {high} lattice units"
             raise ExperimentError(text, where)
         return distinct(rows)
 

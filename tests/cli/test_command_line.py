@@ -198,6 +198,7 @@ WRONG = {
     "init from no shipped one": (2, ["init", "--from", "paper/f3"], "paper/f3: is not a shipped experiment; did you mean 'paper/f2'?"),
     "no shipped experiment": (2, ["experiments", "f1"], "f1: is not a shipped experiment; `pbdkit experiments` lists them"),
     "plot of nothing": (6, ["plot", "o.nc"], "o.nc: there is no such file"),
+    "plot in no folder": (6, ["plot", "no/o.nc"], "no/o.nc: there is no such file"),
 }  # fmt: skip
 
 

@@ -113,7 +113,19 @@ def test_slot_too_narrow_for_the_frame_gives_a_warning(gap, narrow):
 REFUSED = {
     "empty body": (
         {"body": {"type": "disc", "radius": 0.1, "centre": [0.5, 0.5]}},
-        "contains no site",
+        "contains no site of the lattice; enlarge it, or move it$",
+    ),
+    "hole larger than the body": (
+        {
+            "body": {
+                "type": "difference",
+                "of": [
+                    {"type": "grid", "columns": 4, "rows": 4},
+                    {"type": "disc", "radius": 9.0, "centre": [0, 0]},
+                ],
+            }
+        },
+        "contains no site of the lattice; make the parts that are subtracted smaller, or the first",
     ),
     "ring inside out": (
         {"body": {"type": "ring", "inner": 3.0, "outer": 2.0, "centre": [0, 0]}},

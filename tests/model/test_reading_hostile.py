@@ -261,8 +261,8 @@ def test_points_far_from_the_body_give_a_warning() -> None:
     far = {"select": {"nearest": [[100.0, 100.0], [9.4, 3.0]]}, "motion": {"type": "hold"}}
     (warning,) = [w for w in checked(leaders=[far])[0].warnings if "nearest" in w]
     assert warning == (
-        "leaders.0.select.nearest: the distance of (100, 100) from the body is 128.7; the nearest "
-        "particle is 131, at (9, 9)"
+        "leaders.0.select.nearest: the distance of (100, 100) from the body is 128.7 lattice "
+        "units; the nearest particle is 131, at (9, 9)"
     )
 
 

@@ -322,6 +322,15 @@ def test_data_without_positions_are_refused(torn):
         torn.assign(position=torn.position * np.nan).pbd.plot()
 
 
+def test_result_without_kinds_is_drawn_by_a_variable(torn):
+    unkind = torn.drop_vars("kind")
+    pictures = [ds.pbd.plot("pe1", filled=False) for ds in (torn, unkind)]
+    assert len({max(len(c.get_offsets()) for c in ax.collections) for ax in pictures}) == 1
+    message = "the kinds of particles, which are drawn by default, were not recorded; .*: .*pe1"
+    with pytest.raises(ExperimentError, match=message):
+        unkind.pbd.plot()
+
+
 def test_variable_without_attributes_is_labelled_with_its_name(torn):
     silent = torn.assign(pe1=torn.pe1.assign_attrs(long_name="", units=""))
     bar = silent.pbd.plot(color="pe1", vmin=0.0, vmax=1.0).figure.axes[1]

@@ -62,6 +62,7 @@ def test_run_and_check_name_the_failing_rule(
 NOT_REAL = {
     "a shape of its own": (GATHER, "return pbdkit.plugin.Vector(d.x[..., 0], d.y[..., 0]), 1.0", "`gather` at the neighbour with the site offset (-1, 0) returned "),
     "apply asks": (APPLY, "return total[0] / total[1] if (total[0].x > 0) | (total[0].x <= 0) else 0.0 * total[0]", "ValueError: The truth value of an array with more than one element is ambiguous. Use a.any() or a.all(); use `pbdkit.plugin.where` instead of `if`, `and` and `or` (pbdkit_odd.py, line 15)"),
+    "set in place": (APPLY, "total[0].x *= 0.5; return total[0]", "AttributeError: can't set attribute; components of a vector cannot be set; make a new one, as `Vector(0.5 * v.x, v.y)` (pbdkit_odd.py, line 15)"),
     "complex numbers": (APPLY, "return 1j * total[0]", "ValueError: it returned values of complex128, not real numbers"),
 }  # fmt: skip
 

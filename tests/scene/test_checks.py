@@ -39,13 +39,13 @@ def test_distant_point_is_named_with_group_particle_and_distance() -> None:
     select = [{"select": nearest, "motion": HOLD}]
     # The corner (4, 2) is a 3-4-5 triangle away, and the last of 9 columns of 5.
     assert warnings_of(leaders=select) == [
-        "leaders.0.select.nearest: the distance of (7, 6) from the body is 5; the nearest particle "
-        "is 45, at (4, 2)"
+        "leaders.0.select.nearest: the distance of (7, 6) from the body is 5 lattice units; the "
+        "nearest particle is 45, at (4, 2)"
     ]
     load = {"select": {"nearest": [[-3.0, 0.0]]}, "force": [1.0, 0.0]}
     assert warnings_of(loads=[load])[0] == (
-        "loads.0.select.nearest: the distance of (-3, 0) from the body is 3; the nearest particle "
-        "is 1, at (0, 0)"
+        "loads.0.select.nearest: the distance of (-3, 0) from the body is 3 lattice units; the "
+        "nearest particle is 1, at (0, 0)"
     )
 
 

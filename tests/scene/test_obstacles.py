@@ -401,8 +401,8 @@ MESSAGES: dict[str, tuple[dict[str, Any], str]] = {
     ),
     "inside": (
         {"shape": {"type": "disc", "radius": 1.2, "centre": [7.1, 4.0]}},
-        "obstacles.0.shape: particle 68 at (7, 4) starts at a depth of 1.1 inside it; start the "
-        "obstacle outside the body and move it there, or start it at a later step",
+        "obstacles.0.shape: particle 68 at (7, 4) starts at a depth of 1.1 lattice units inside "
+        "it; start the obstacle outside the body and move it there, or start it at a later step",
     ),
     "infinite": (
         {
