@@ -186,7 +186,7 @@ class ConstrainedSubsystem(Subsystem):
         self,
         matrix: Any,
         method: str,
-        coordinates: Coordinates,
+        coordinates: Coordinates | None,
         watch: Watch,
     ) -> None:
         if isinstance(matrix, np.ndarray) and method not in ("auto", "lu"):
@@ -623,10 +623,16 @@ class MatrixSystem(System):
             motions = np.column_stack([motions, np.where(along == 0, -y, x)])
         return bool(np.linalg.matrix_rank(motions) == motions.shape[1])
 
-    def _coordinates(self, axes: list[int], members: Indices) -> Coordinates:
+    def _coordinates(self, axes: list[int], members: Indices) -> Coordinates | None:
         """Return the coordinates of the given unknowns. If the unknowns belong to one axis,
-        particles with a prescribed component along this axis are listed with the leaders."""
+        particles with a prescribed component along this axis are listed with the leaders.
+
+        Return None if a component of a particle belongs to another part: the last intact bonds of
+        the particle may couple one component only.
+        """
         where, is_guided = members[:: len(axes)] // len(axes), self._guided[:, axes]
+        if not np.array_equal(members // len(axes), np.repeat(where, len(axes))[: len(members)]):
+            return None
         positions = self._X[is_guided[:, 0]] if len(axes) == 1 else self._X[:0]
         guided = is_guided[where].ravel() if len(axes) > 1 and is_guided.any() else None
         return Coordinates(

@@ -345,3 +345,15 @@ def test_equilibria_within_a_step_are_plotted_and_explained(call, tmp_path):
     assert call("curve", "dogbone.nc", "load-displacement", "-o", "curve.png").code == 0
     explained = call("explain", "dogbone.nc", "--bond", a, b).out
     assert re.search(r"largest strain in a recorded step: .*, in step 0\.", explained)
+
+
+def test_a_particle_can_hang_by_bonds_along_one_axis(monkeypatch):
+    """With random strengths, the last bonds of a particle can couple one of its components to the
+    clamped part and leave the other one free."""
+    monkeypatch.setattr(breaking_kernel, "COMPILING_S", math.inf)
+    settings = "fracture.scatter=0.1", "seed=2", "steps=24"
+    ds = pbdkit.run(pbdkit.load("modelling/dogbone-to-failure", settings=settings), progress=False)
+    assert ds.attrs["status"] == "complete"
+    force = np.abs(ds.reaction.values[:, 1, 0])
+    assert force.max() > 1000.0
+    assert force[-1] < 1e-6 * force.max()
