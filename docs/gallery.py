@@ -21,6 +21,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import xarray
 from matplotlib.figure import Figure
+from sheet import Sheet
 from sphinx.application import Sphinx
 from sphinx.util.display import status_iterator
 
@@ -72,6 +73,9 @@ html_theme.sidebar_secondary.remove: true
 Every shipped experiment with its picture, its movie and its file. `pbdkit run NAME` runs one, and
 `pbdkit init --from NAME` copies its file. The movies of the paper's cases
 show early steps at shorter intervals.
+"""
+SHEET = """
+All experiments on one page for print: {download}`experiments.pdf`.
 """
 PAGE = """---
 html_theme.sidebar_secondary.remove: true
@@ -130,14 +134,16 @@ def write_gallery(app: Sphinx) -> None:
     shutil.rmtree(FOLDER, ignore_errors=True)
     FOLDER.mkdir()
     entries = [Entry.read(name) for name in shipped_names()]
-    names = attrgetter("name")
+    names, sheet = attrgetter("name"), Sheet(len(entries))
     for entry in status_iterator(entries, "gallery... ", length=len(entries), stringify_func=names):
         for file in shipped_data(entry.name):
             shutil.copy(file, FOLDER)
         (FOLDER / f"{entry.stem}.yaml").write_text(entry.source, "utf-8")
         if app.config.gallery_run:
-            entry.draw()
+            entry.draw(sheet)
         (FOLDER / f"{entry.stem}.md").write_text(entry.page(drawn=app.config.gallery_run), "utf-8")
+    if app.config.gallery_run:
+        sheet.save(FOLDER / "experiments.pdf", FOLDER / "experiments.png")
     index = "\n".join(index_lines(entries, drawn=app.config.gallery_run))
     (FOLDER / "index.md").write_text(index, "utf-8")
 
@@ -145,6 +151,8 @@ def write_gallery(app: Sphinx) -> None:
 def index_lines(entries: list[Entry], *, drawn: bool) -> Iterator[str]:
     """Yield the lines of the index: a card with a thumbnail for each experiment."""
     yield INDEX
+    if drawn:
+        yield SHEET
     for group, heading in GROUPS.items():
         members = [entry for entry in entries if entry.group == group]
         yield f"## {heading}\n\n::::{{grid}} 2 3 3 4\n:gutter: 3\n"
@@ -213,6 +221,13 @@ class Entry:
         arguments |= {"filled": True} if "--field" in self.options else {}
         return arguments | ({"time": times if len(times) > 1 else times[0]} if times else {})
 
+    @property
+    def shown(self) -> tuple[str, float | None]:
+        """Return the variable and the step of the thumbnail."""
+        times = self.arguments.get("time")
+        time = times[len(times) // 2] if isinstance(times, list) else times
+        return self.arguments["color"], time
+
     def page(self, *, drawn: bool) -> str:
         """Return the Markdown of the page."""
         text = re.sub(r"\A.*?\.(?=\s)", "", self.text, count=1, flags=re.S).partition("\n\n")[0]
@@ -240,9 +255,10 @@ class Entry:
         """True if the experiment makes steps, rather than one equilibrium."""
         return "solver: {type: equilibrium" not in self.source
 
-    def draw(self) -> None:
-        """Run the experiment, and write picture, thumbnail and movie."""
+    def draw(self, sheet: Sheet) -> None:
+        """Run the experiment, write picture, thumbnail and movie, and add it to a sheet."""
         dataset = pbdkit.run(self.name, progress=False)
+        sheet.add(self.name, dataset, *self.shown)
         times = self.arguments.get("time")
         several = isinstance(times, list)
         size = {} if several else {"figsize": FIGSIZE}
