@@ -1,8 +1,8 @@
 """One page with small pictures of all shipped experiments, 180 mm wide, for print.
 
-`python docs/sheet.py [FILE.pdf]` runs the experiments and writes the page, by default
-`experiments.pdf`; the site is built with the same page. Texts and axes are vectors, and fields are
-pixels.
+`python docs/sheet.py [FILE.pdf] [EXPERIMENT ...]` runs the experiments and writes the page, by
+default `experiments.pdf`; the site is built with the same page. Texts and axes are vectors, and
+fields are pixels.
 """
 
 from __future__ import annotations
@@ -28,15 +28,17 @@ MM = 1.0 / 25.4
 """A millimetre in inches."""
 WIDTH_MM = 180.0
 """Width of the page."""
-COLUMNS = 6
+COLUMNS = 5
 """Number of pictures in a row."""
 CELL_MM = (WIDTH_MM / COLUMNS, 28.5)
 """Width and height of the space of a picture with its texts."""
-BODY_MM = (26.5, 16.0)
+BODY_MM = (32.0, 16.0)
 """Width and height of a picture."""
+MARGIN_MM = 2.0
+"""Height of the space below the last row."""
 BAR_MM = (17.0, 1.1)
 """Width and height of a colour bar."""
-TITLE_PT, LABEL_PT, TICK_PT = 6.0, 5.2, 5.0
+TITLE_PT, LABEL_PT, TICK_PT = 5.8, 5.2, 5.0
 """Sizes of texts in points."""
 DPI = 400
 """Resolution of fields in pixels per inch."""
@@ -62,7 +64,7 @@ class Sheet:
 
     def __init__(self, count: int) -> None:
         self._rows, self._added = math.ceil(count / COLUMNS), 0
-        size = (WIDTH_MM * MM, self._rows * CELL_MM[1] * MM)
+        size = (WIDTH_MM * MM, (self._rows * CELL_MM[1] + MARGIN_MM) * MM)
         self.figure = Figure(figsize=size, dpi=DPI)
         FigureCanvasAgg(self.figure)
 
@@ -71,9 +73,9 @@ class Sheet:
         with rc_context(STYLE):
             row, column = divmod(self._added, COLUMNS)
             self._added += 1
-            left, top = column * CELL_MM[0], (self._rows - row) * CELL_MM[1]
+            left, top = column * CELL_MM[0], (self._rows - row) * CELL_MM[1] + MARGIN_MM
             middle = left + CELL_MM[0] / 2
-            self._write(middle, top - 1.0, name, TITLE_PT, "top", weight="bold")
+            self._write(middle, top - 1.0, name, TITLE_PT, "top")
             corner = middle - BODY_MM[0] / 2, top - 4.6 - BODY_MM[1]
             recording = Trajectory(dataset, color)
             assert recording.quantity is not None
@@ -106,7 +108,7 @@ class Sheet:
         bar.ax.set_xticklabels([f"{t / ten:.3g}".replace("-", "−") for t in bar.get_ticks()])
         bar.ax.tick_params(labelsize=TICK_PT, length=1.2, width=0.4, pad=0.8)
         bar.outline.set_linewidth(0.3)
-        text = label(quantity.meaning, quantity.units, scale.exponent, width=28)
+        text = label(quantity.meaning, quantity.units, scale.exponent, width=38)
         self._write(middle, top - BAR_MM[1] - 2.6, text, LABEL_PT, "top", linespacing=1.0)
 
     def _axes(self, left: float, bottom: float, width: float, height: float) -> Any:
@@ -143,13 +145,14 @@ def main() -> None:
     import pbdkit
     from pbdkit.model.shipped import shipped_names
 
-    names = shipped_names()
+    file, *chosen = sys.argv[1:] or ["experiments.pdf"]
+    names = chosen or shipped_names()
     sheet = Sheet(len(names))
     for name in names:
         entry = Entry.read(name)
         sheet.add(name, pbdkit.run(name, progress=False), *entry.shown)
         print(name)
-    sheet.save(Path(sys.argv[1] if len(sys.argv) > 1 else "experiments.pdf"))
+    sheet.save(Path(file))
 
 
 if __name__ == "__main__":
