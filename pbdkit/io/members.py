@@ -26,6 +26,8 @@ TEXT = "_text"
 the coordinate of the dimension itself contains only their numbers."""
 PARAMETER = "parameter"
 """Attribute of a coordinate that contains the path of its parameter in the experiment."""
+FILL = "fill_value"
+"""Name of the attribute with the value that replaces missing integers."""
 MAX_SHOWN = 6
 """Maximum number of values in messages."""
 
@@ -44,7 +46,8 @@ def member(dataset: xarray.Dataset, choice: Mapping[str, Any]) -> xarray.Dataset
     """Return the part of a sweep in which parameters have the chosen values.
 
     If every parameter is given, the result is a single member. It then has the experiment of this
-    member as an attribute, and its title contains the choice.
+    member as an attribute, and its title contains the choice. Its dimensions are those of a single
+    run, without the particles, bonds and other objects that only other members have.
 
     Parameters
     ----------
@@ -146,6 +149,27 @@ def _with_experiment(selection: xarray.Dataset) -> xarray.Dataset:
         n for n, v in selection.data_vars.items() if "time" in v.dims and v.dtype.kind == "f"
     ]
     run = selection.dropna("time", how="all", subset=growing) if growing else selection.copy()
+    run = _without_padding(run)
     attributes = {name: value for name, value in selection.attrs.items() if name != SWEEP}
     run.attrs = attributes | {"experiment": json.dumps(source.data)}
     return run
+
+
+def _without_padding(run: xarray.Dataset) -> xarray.Dataset:
+    """Return a member without the labels of dimensions at which every variable is missing, because
+    only other members have them. A member without a result is returned unchanged."""
+    rows = {}
+    for dim in {str(dim) for dim in run.dims} - {"time"}:
+        present, has_evidence = np.zeros(run.sizes[dim], bool), False
+        variables = [v for name, v in run.variables.items() if dim in v.dims and name != dim]
+        for variable in sorted(variables, key=lambda v: v.size):
+            if variable.dtype.kind not in "iuf" or present.all():
+                continue
+            values, has_evidence = np.moveaxis(variable.values, variable.dims.index(dim), 0), True
+            is_float = values.dtype.kind == "f"
+            exists = ~np.isnan(values) if is_float else values != variable.attrs.get(FILL)
+            present |= exists.reshape(len(values), -1).any(axis=1)
+        if has_evidence and not present.all():
+            rows[dim] = np.flatnonzero(present)
+    has_result = "particle" not in rows or len(rows["particle"])
+    return run.isel(rows) if has_result else run

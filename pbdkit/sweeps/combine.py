@@ -18,7 +18,7 @@ from pbdkit.io.layout import (
     refuse_unknown_matching,
     reserved_names,
 )
-from pbdkit.io.members import STATUS
+from pbdkit.io.members import FILL, STATUS
 from pbdkit.memory import machine_memory
 from pbdkit.sweeps.specification import MESSAGE, Dimension, Member, names_of, values_along
 from pbdkit.sweeps.worker import STORED_STATUSES, MemberReport, MemberVariable, unpacked
@@ -166,8 +166,6 @@ def _attributes(runs: list[xarray.Dataset]) -> list[str]:
 
 
 Reports = Callable[[str], MemberReport]
-FILL = "fill_value"
-"""Name of the attribute with the value that replaces missing integers."""
 
 
 def combine_members(

@@ -34,7 +34,7 @@ from pbdkit.io.layout import (
     scene_of,
     with_principal_values,
 )
-from pbdkit.io.members import STATUS, SWEEP, TEXT, type_alone
+from pbdkit.io.members import FILL, STATUS, SWEEP, TEXT, type_alone
 from pbdkit.io.open import reading
 from pbdkit.io.physical import TWIN_OF
 from pbdkit.lattice.raster import FOLLOWER, FRAME, LEADER
@@ -48,7 +48,6 @@ from pbdkit.scene.scene import Scene
 from pbdkit.stability.analysis import Analysis
 from pbdkit.stability.relaxation import tuned
 from pbdkit.stepping.state import describe_bonds
-from pbdkit.sweeps.combine import FILL
 from pbdkit.sweeps.specification import CASE, MESSAGE
 from pbdkit.sweeps.worker import STORED_STATUSES
 from pbdkit.web.page import packed, page

@@ -88,6 +88,24 @@ def test_member_equals_the_run_of_its_parameters(swept):
     assert swept.pbd.member(steel=0.2).status.dims == ("poisson_ratio", "span")
 
 
+@pytest.mark.parametrize(
+    ("name", "settings", "path", "values"),
+    [
+        ("material/hole", {}, "lattice.a", [0.25, 0.5]),
+        ("paper/d1", {"steps": 60}, "body.columns", [8, 10]),
+    ],
+)
+def test_member_has_only_the_particles_and_bonds_of_a_plain_run(name, settings, path, values):
+    experiment = pbdkit.load(name, settings=settings)
+    swept = pbdkit.sweep(experiment, vary={path: values}, workers=1, progress=False)
+    for value in values:
+        one = swept.pbd.member(**{path.rpartition(".")[2]: value})
+        plain = pbdkit.run(experiment, settings={path: value}, progress=False)
+        assert dict(one.sizes) == dict(plain.sizes)
+        for each, variable in plain.variables.items():
+            assert variable.equals(one[each].variable), each
+
+
 def test_maps_are_drawn_at_rest_without_recorded_positions(swept):
     ax = swept.pbd.member(poisson_ratio=0.3, steel=0.2, span=8).pbd.plot("u_x")
     assert "drawn at rest" in ax.get_title()
