@@ -499,7 +499,7 @@ def _named(
     kind: str,
     values: Any,
     more: Mapping[str, float] | None = None,
-    convert: Callable[[Any], Any] = float,
+    convert: Callable[[Any], Any] | None = None,
 ) -> Any:
     """Return a named tuple of Python floats. numpy's scalars are not used because they would
     promote single precision to double precision. Another function can convert the values."""
@@ -511,7 +511,7 @@ def _named(
     numbers = {**values, **constants}
     for name, value in numbers.items():
         try:
-            numbers[name] = convert(value)
+            numbers[name] = convert(value) if convert else float(value)
         except (TypeError, ValueError):
             raise TypeError(
                 f"it returned {type(value).__name__} as '{name}', not a number; return one number "
