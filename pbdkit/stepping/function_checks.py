@@ -83,6 +83,9 @@ def _check(scene: Scene, state: State) -> None:
         )
     except PluginError:
         raise
+    except KeyboardInterrupt:
+        rule = full_description(type(scene.experiment.rule))
+        raise KeyboardInterrupt(f"in {rule} at the beginning of the run") from None
     except (Exception, SystemExit):  # The run reports the error, with the step.
         return
     for answer, other in zip(first, second, strict=True):
