@@ -96,7 +96,7 @@ def probe(scene: Scene, spacing: float) -> RuleProperties:
     If the rule depends on the position, it is also evaluated in the corners of the body.
     """
     stencils = {place: linearised(scene, place) for place in _places(scene)}
-    half = tuple(_half_neighbourhood(slots) for slots in scene.neighbourhood.slots)
+    beyond = frozenset(filter(_is_beyond_an_edge, scene.neighbourhood.every))
     cases = [(rule, place) for rule in _single_rules(scene) for place in stencils]
     return RuleProperties(
         next(iter(stencils.values())),
@@ -104,7 +104,7 @@ def probe(scene: Scene, spacing: float) -> RuleProperties:
         all(_is_linear(rule, place, AMPLITUDE * spacing, ROUNDING) for rule, place in cases),
         all(_commutes_with_rotation(rule, place, spacing) for rule, place in cases),
         all(_is_symmetric(stencil) for stencil in stencils.values()),
-        all(_move_at_rest(rule, place, half) <= ROUNDING * spacing for rule, place in cases),
+        all(_move_at_rest(rule, place, beyond) <= ROUNDING * spacing for rule, place in cases),
     )
 
 
@@ -113,10 +113,7 @@ def _reasons(
 ) -> Iterator[str]:
     """Yield reasons why the rule is neither diffusion nor elasticity, except those from long
     waves."""
-    drift = (
-        max(_move_at_rest(rule, place, scene.neighbourhood.slots) for rule, place in cases)
-        / spacing
-    )
+    drift = max(_move_at_rest(rule, place) for rule, place in cases) / spacing
     if not drift <= STILL:
         yield f"a body at rest does not remain at rest: the rule moves it by {drift:.6g} h per step"
     if not all(_is_linear(rule, place, SMALL * spacing, STRAIGHT) for rule, place in cases):
@@ -145,16 +142,17 @@ def _places(scene: Scene) -> list[Here]:
     ]
 
 
-def _half_neighbourhood(slots: Slots) -> Slots:
-    """Return the neighbours of a particle at a free edge: those on one side of a slanted line."""
-    return tuple(slot for slot in slots if slot.rest.x + SLANT * slot.rest.y > 0.0)
+def _is_beyond_an_edge(slot: Slot) -> bool:
+    """Return whether a particle at a free edge, a slanted line, lacks the neighbour."""
+    return not slot.rest.x + SLANT * slot.rest.y > 0.0
 
 
-def _move_at_rest(scene: Scene, at: Here, slots: tuple[Slots, ...]) -> float:
+def _move_at_rest(scene: Scene, at: Here, missing: frozenset[Slot] = frozenset()) -> float:
+    """Return the largest component of the move at rest of a particle with a neighbour."""
     moves = [
-        np.abs(_move(scene, sublattice_slots, {}, at)).max()
-        for sublattice_slots in slots
-        if sublattice_slots
+        np.abs(_move(scene, slots, {}, at, missing)).max()
+        for slots in scene.neighbourhood.slots
+        if not missing.issuperset(slots)
     ]
     return float(max(moves, default=0.0))
 
@@ -231,11 +229,13 @@ def _place_dependence(scene: Scene, stencils: dict[Here, Stencil]) -> Iterator[s
     yield text + (verdict if parameters else "")
 
 
-def _move(scene: Scene, slots: Slots, d: Differences, at: Here) -> Floats:
+def _move(
+    scene: Scene, slots: Slots, d: Differences, at: Here, missing: frozenset[Slot] = frozenset()
+) -> Floats:
     zero = vector(np.zeros(scene.axes))
     with np.errstate(all="ignore"):
         move_vector = move(
-            scene, slots, lambda k: vector(d[k]) if k in d else zero, at._replace(u=zero)
+            scene, slots, lambda k: vector(d[k]) if k in d else zero, at._replace(u=zero), missing
         )
     return np.array(move_vector, float)
 

@@ -15,8 +15,8 @@ eigenvalues of plane waves. This bound is computed within milliseconds.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Container, Iterator, Sequence
+from dataclasses import dataclass, replace
 from itertools import product
 from operator import add
 from typing import Any, cast
@@ -98,18 +98,32 @@ class Stencil:
     neighbours: dict[Slot, Floats]
 
 
-def move(scene: Scene, slots: Sequence[Slot], difference: Callable[[Slot], Any], here: Here) -> Any:
-    """Compute the move of a particle with all its neighbours.
+def move(
+    scene: Scene,
+    slots: Sequence[Slot],
+    difference: Callable[[Slot], Any],
+    here: Here,
+    missing: Container[Slot] = (),
+) -> Any:
+    """Compute the move of a particle.
 
     Parameters
     ----------
+    slots
+        All slots of its sublattice.
     difference
         Difference d of the displacements along each slot.
     here
         Place of the particle and its displacement.
+    missing
+        Slots along which there is no neighbour.
     """
     evaluator = Evaluator(scene)
-    total = evaluator.total([*map(difference, slots)], here.u, evaluator.everywhere(slots))
+    neighbours = [
+        replace(neighbour, present=np.zeros((), bool)) if slot in missing else neighbour
+        for slot, neighbour in zip(slots, evaluator.everywhere(slots), strict=True)
+    ]
+    total = evaluator.total([*map(difference, slots)], here.u, neighbours)
     return evaluator.move(total, here._replace(own=evaluator.initial_own()))
 
 

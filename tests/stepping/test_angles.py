@@ -211,3 +211,16 @@ def test_every_property_holds():
         report = examine(Hinges(), lattice={"type": "hexagonal", "a": 0.7})
     assert report.holds, str(report)
     assert {"changes-no-input", "is-the-same-compiled"} <= {o.property for o in report.outcomes}
+
+
+@pytest.mark.parametrize("lattice", ["square", "hexagonal"])
+def test_conformal_rule_is_identified(lattice):
+    """Harmonic functions are its equilibria: in the interior it moves to the mean of the 4 or 6
+    neighbours, which diffuses with D = h²/4, and rotations are preserved, also at edges."""
+    settings = ["rule={type: conformal}", f"lattice.type={lattice}", "leaders=[]"]
+    identity = pbdkit.identify(pbdkit.load("paper/a", components=[Conformal], settings=settings))
+    assert (identity.kind, identity.isotropic) == ("diffusion", True)
+    assert identity.diffusivity == pytest.approx(0.25, rel=1e-12)
+    assert identity.linear
+    assert identity.turns
+    assert identity.rests_at_edges
