@@ -273,7 +273,8 @@ def curve(**options: Any) -> None:
     broken-bonds       their number over the steps
 
     KIND is by default the first that the result has. --y alone draws that variable over the steps,
-    and with --particle or --bond its history there. Results of sweeps have a line for each member.
+    and with --particle or --bond its history there. Results of sweeps have a line for each member;
+    for cracks, and load-displacement of groups and obstacles, select one member with --at.
     """
     call("plot:curve", **options)
 

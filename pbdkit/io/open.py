@@ -3,6 +3,7 @@ another kind, the error message contains the command that reads it."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,7 +19,7 @@ from pbdkit.errors import (
     reason_of,
     warn_caller,
 )
-from pbdkit.io.layout import SCHEMA_VERSION, base_columns, in_this_layout
+from pbdkit.io.layout import SCHEMA_VERSION, base_columns, in_this_layout, json_attribute
 from pbdkit.io.members import SWEEP, choices, member
 from pbdkit.io.other_files import refuse_other_file
 from pbdkit.io.run_store import STORE, has_committed
@@ -31,6 +32,10 @@ if TYPE_CHECKING:
 
 UNSEALED = "has no seal: changes since it was written cannot be detected"
 """Warning for a file without a seal."""
+OF_PARTICLES = ("number", "reference", "role", "site", "i", "j", "X", "Y")
+"""Coordinates of particles, which a sweep keeps with each variable of particles."""
+MISSING_VARIABLE = re.compile(r"No variable named '(\w+)'")
+"""Beginning of the message of xarray for a variable that a dataset does not contain."""
 
 
 def open(path: str | Path) -> xarray.Dataset:
@@ -172,8 +177,24 @@ def reading(
         except (PbdkitError, MemoryError):
             raise
         except Exception as error:
+            if name := _not_kept(error, whole):
+                kept_with = "`position`" if name in OF_PARTICLES else "it"
+                raise ExperimentError(
+                    f"{path}: this requires `{name}`, which the sweep did not keep; add "
+                    f"{kept_with} to keep.variables, and run the sweep again"
+                ) from None
             reason = f"{type(error).__name__}: {error}"
             raise StorageError(f"{path}: is damaged, or was changed: {one_line(reason)}") from error
+
+
+def _not_kept(error: Exception, dataset: xarray.Dataset) -> str | None:
+    """Return the name of the variable of a sweep that an error misses, if the sweep keeps only
+    selected variables. xarray reports missing variables as KeyError."""
+    missing = MISSING_VARIABLE.match(str(error.args[0])) if isinstance(error, KeyError) else None
+    if missing is None or missing[1] in dataset.variables or SWEEP not in dataset.attrs:
+        return None
+    keep = json_attribute(dataset, SWEEP).get("keep") or {}
+    return missing[1] if keep.get("variables") else None
 
 
 def _chosen(dataset: xarray.Dataset, path: str | Path, at: Mapping[str, str]) -> xarray.Dataset:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from typing import Annotated, Any, ClassVar, Literal
@@ -325,6 +325,31 @@ class Difference(Composed):
         all other parts."""
         first, *rest = (part.distance(sites) for part in self.of)
         return reduce(np.maximum, (-other for other in rest), first)
+
+
+def concave_arcs(body: Body) -> Iterator[tuple[str, float]]:
+    """Yield each arc of an outline at which the material surrounds the centre of the arc, as text
+    such as "disc", and its radius."""
+    if isinstance(body, Ring):
+        yield "inner circle", body.inner
+    elif isinstance(body, Dogbone):
+        yield "fillet", body.radius
+    elif isinstance(body, Difference):
+        yield from concave_arcs(body.of[0])
+        for part in body.of[1:]:
+            yield from discs(part)
+    elif isinstance(body, Composed):
+        for part in body.of:
+            yield from concave_arcs(part)
+
+
+def discs(body: Body) -> Iterator[tuple[str, float]]:
+    """Yield "disc" and the radius of each disc of a body, except those that it subtracts."""
+    if isinstance(body, Disc):
+        yield "disc", body.radius
+    elif isinstance(body, Composed):
+        for part in body.of[:1] if isinstance(body, Difference) else body.of:
+            yield from discs(part)
 
 
 def _hull(boxes: list[Box]) -> Box:

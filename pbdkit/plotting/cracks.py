@@ -116,7 +116,7 @@ def _broken(dataset: xarray.Dataset) -> CrackBonds:
     if extra_dims := member_dims(dataset["broken_step"]):
         raise ExperimentError(
             f"the dataset contains several runs, along {', '.join(extra_dims)}; select one with "
-            "isel"
+            "--at NAME=VALUE, in Python with ds.pbd.member(NAME=VALUE) or isel"
         )
     steps = dataset["broken_step"].values
     rows = np.flatnonzero(steps >= 0)

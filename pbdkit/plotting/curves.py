@@ -106,7 +106,13 @@ def _displacements(dataset: xarray.Dataset, dim: str) -> Any:
     if extra_dims := [str(d) for d in dataset[FORCE_OF[dim]].dims if d not in OF_A_RUN]:
         raise ExperimentError(
             f"a sweep has no single force-displacement curve (along {', '.join(extra_dims)}); "
-            "select one member with isel, or give x and y"
+            "select one with --at NAME=VALUE, in Python with ds.pbd.member(NAME=VALUE), or give x "
+            "and y"
+        )
+    if "position" not in dataset.variables:
+        raise ExperimentError(
+            "load-displacement requires `position`, which the dataset does not contain; of a "
+            "sweep, add it to keep.variables, and run the sweep again"
         )
     scene = scene_of(dataset, "the way of leaders and obstacles")
     if dim == "obstacle":

@@ -650,7 +650,7 @@ def of_one_run(dataset: xarray.Dataset) -> xarray.Dataset:
         first = ", ".join(f"{d}=0" for d in extra_dims)
         raise ExperimentError(
             f"a picture shows one run, but the dataset contains several ({sizes}); select one "
-            f"with isel or sel: ds.isel({first}).pbd.plot(...)"
+            f"with --at NAME=VALUE, in Python with isel or sel: ds.isel({first}).pbd.plot(...)"
         )
     if dataset.sizes["axis"] != 2:
         raise ExperimentError(
@@ -872,7 +872,10 @@ def _one_of(values: xarray.DataArray, dim: str, argument: str, place: int | None
     if place not in places:
         text = "several are recorded" if place is None else f"there is no {place}"
         description = f"'{values.name}' has {dim.replace('_', ' ')}s {', '.join(map(str, places))}"
-        raise ExperimentError(f"{description}: {text}; select one by {argument}={places[-1]}")
+        raise ExperimentError(
+            f"{description}: {text}; select one by "
+            f"--{argument} {places[-1]}, in Python by {argument}={places[-1]}"
+        )
     meaning = f"{values.attrs.get('long_name', values.name)} {place}"
     return values.sel({dim: place}).assign_attrs(long_name=meaning)
 

@@ -14,11 +14,13 @@ from pbdkit.errors import AccuracyWarning, WarningText
 from pbdkit.lattice.fill import has_narrow_slot
 from pbdkit.lattice.neighbourhood import Neighbourhood, flatness
 from pbdkit.lattice.raster import FOLLOWER, OmittedCells, Raster, cells_of_sites, positions
+from pbdkit.model.bodies import concave_arcs, discs
 from pbdkit.model.experiment import Experiment
 from pbdkit.model.motions import Newton, Oscillation, Rotation
 from pbdkit.plugin import Lattice, MixesCells, Vector
 from pbdkit.plugin.fields import ByRegion
 from pbdkit.plugin.rule import material_of
+from pbdkit.plugin.units import STRESS, in_lengths
 from pbdkit.scene.constants import signed_distance
 from pbdkit.scene.selection import Selecting
 
@@ -48,6 +50,10 @@ LOCKING_FACTOR = 0.07
 """Factor k in the relative excess stiffness in bending, which is about k c_shear / (λ n) for a body
 that is n cells thick. λ is the smallest stiffness of a cell, which belongs to a mode that extends
 one axis and contracts the other."""
+MIN_CELLS = 5
+"""Number of lattice constants in a radius below which a warning is issued."""
+RADIUS_RTOL = 1e-9
+"""Relative tolerance of radii in this comparison."""
 MAX_LOCKING = 0.05
 """Relative excess stiffness above which a warning is issued."""
 
@@ -98,6 +104,30 @@ def narrow_voids(lattice: Lattice, left_out: OmittedCells) -> Iterator[str]:
             "two cells wide: they would connect its two sides; use a finer lattice, with two cells "
             "across the void, or `cuts` for a crack of zero width"
         )
+
+
+def coarse_arcs(experiment: Experiment, raster: Raster) -> Iterator[str]:
+    """Generate a warning for each hole, fillet or inclusion with fewer than `MIN_CELLS` lattice
+    constants in its radius, if stress at particles is computed with a calibrated rule."""
+    rule, variables = experiment.rule, [v for d in experiment.diagnostics for v in d.variables()]
+    has_stress = any("particle" in v.dims and v.units == STRESS.lattice for v in variables)
+    if not has_stress or material_of(rule) is None:
+        return
+    fields = [field for field in rule.varying.values() if isinstance(field, ByRegion)]
+    names = {name for field in fields for name, _ in field.values}
+    arcs = {("body", *arc) for arc in concave_arcs(experiment.body)}
+    for name in names & {*experiment.regions}:
+        arcs |= {(f"regions.{name}", *arc) for arc in discs(experiment.regions[name])}
+    constant = max(math.hypot(*vector) for vector in raster.cell.vectors)
+    length, unit = in_lengths(experiment.units)
+    for place, shape, radius in sorted(arcs):
+        if radius < MIN_CELLS * constant * (1 - RADIUS_RTOL):
+            yield WarningText(
+                f"{place}: the {shape} of radius {length * radius:.4g} {unit} has "
+                f"{radius / constant:.3g} lattice constants in its radius; the stress at its rim "
+                f"needs at least {MIN_CELLS}; use a finer lattice (docs/refinement.md)",
+                AccuracyWarning,
+            )
 
 
 def locking(

@@ -387,6 +387,7 @@ def _build(experiment: Experiment, ground: LatticeSetup) -> Scene:
         *checks.far_from_the_body(experiment, raster),
     ]
     warnings += [*checks.angles_in_radians(experiment), *checks.locking(experiment, raster, box)]
+    warnings += checks.coarse_arcs(experiment, raster)
     warnings += checks.narrow_voids(experiment.lattice, ground.left_out)
     warnings += missing_segments(raster, neighbourhood, _segments(experiment))
     setting = setting_of(raster, neighbourhood, box)

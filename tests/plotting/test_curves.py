@@ -327,7 +327,7 @@ def test_data_without_a_curve_are_refused(torn, asked, said):
 
 def test_ambiguous_group_must_be_selected(pulled):
     with pytest.raises(
-        pbdkit.ExperimentError, match="leader groups 0, 1: several are recorded; select one by grou"
+        pbdkit.ExperimentError, match="0, 1: several are recorded; select one by --group"
     ):
         pulled.pbd.curve(y="reaction_x")
     with pytest.raises(pbdkit.ExperimentError, match="there is no leader group 7; there are 0, 1"):
@@ -377,8 +377,30 @@ def test_leader_curve_of_a_sweep_requires_one_member():
     led = experiment(**CALIBRATED, leaders=[HELD, pull_right(0.01, 0.0)], steps=2,
                      diagnostics=[{"type": "reaction", "youngs_modulus": 2.0}])  # fmt: skip
     found = pbdkit.sweep(led, vary={"solver.relaxation": [0.5, 1.0]}, workers=1, progress=False)
-    with pytest.raises(pbdkit.ExperimentError, match=r"relaxation.; select one member with isel"):
+    with pytest.raises(pbdkit.ExperimentError, match=r"relaxation.; select one with --at"):
         found.pbd.curve()
+
+
+def test_variables_that_a_sweep_did_not_keep_are_no_damage(call, tmp_path):
+    led = experiment(**CALIBRATED, leaders=[HELD, pull_right(0.01, 0.0)], steps=2,
+                     diagnostics=[{"type": "reaction", "youngs_modulus": 2.0}])  # fmt: skip
+    found = pbdkit.sweep(
+        led, vary={"solver.relaxation": [0.5, 1.0]}, keep={"variables": ["reaction"]}, workers=1,
+        progress=False,
+    )  # fmt: skip
+    file = str(tmp_path / "s.nc")
+    found.to_netcdf(file)
+    at = ["--at", "relaxation=0.5"]
+    curve = call("curve", file, "load-displacement", *at)
+    assert (curve.code, "damaged" in curve.err) == (2, False)
+    assert "load-displacement requires `position`" in curve.err
+    strain = call("curve", file, "--bond", "1", "2", *at)
+    assert (strain.code, "damaged" in strain.err) == (2, False)
+    assert "requires `number`, which the sweep did not keep; add `position` to kee" in strain.err
+    whole = call("curve", file, "load-displacement")
+    assert (whole.code, "select one with --at NAME=VALUE" in whole.err) == (2, True)
+    force = call("curve", file, "--y", "reaction_x", *at)
+    assert (force.code, "select one by --group 1, in Python by group=1" in force.err) == (2, True)
 
 
 def test_members_are_labelled_by_the_types_of_their_components():

@@ -34,6 +34,47 @@ def warnings_of(**parts: Any) -> list[str]:
     return [*build_scene(pbdkit.Experiment(**whole | parts)).warnings]
 
 
+@pytest.mark.parametrize(
+    ("name", "settings", "words"),
+    [
+        ("material/hole", {}, []),
+        ("material/hole", {"lattice.a": 0.1}, []),
+        (
+            "material/hole",
+            {"lattice.a": 0.2},
+            ["body: the disc of radius 0.5 lattice units has 2.5"],
+        ),
+        ("material/hole", {"lattice.a": 0.2, "diagnostics": [{"type": "displacement"}]}, []),
+        (
+            "modelling/composite-plate",
+            {"lattice.a": "2 mm"},
+            [
+                "body: the disc of radius 6 mm has 3 ",
+                "regions.steel: the disc of radius 8 mm has 4 ",
+            ],
+        ),
+    ],
+)
+def test_hole_and_inclusion_of_few_cells_have_a_warning(
+    name: str, settings: dict[str, Any], words: list[str]
+) -> None:
+    warnings = build_scene(pbdkit.load(name, settings=settings)).warnings
+    coarse = [text for text in warnings if "in its radius; the stress at its rim" in text]
+    assert len(coarse) == len(words)
+    assert all(text.startswith(word) for text, word in zip(coarse, words, strict=True))
+
+
+def test_fillets_and_rings_of_few_cells_have_a_warning() -> None:
+    stress = [{"type": "stress", "youngs_modulus": 1.0}]
+    ring = {"type": "ring", "inner": 1.0, "outer": 4.0, "centre": [4.0, 4.0]}
+    (text,) = warnings_of(body=ring, diagnostics=stress)
+    assert text.startswith("body: the inner circle of radius 1 lattice units has 2 lattice const")
+    bone = {"type": "dogbone", "length": 24.0, "width": 9.0, "gauge_length": 10.0,
+            "gauge_width": 6.0, "radius": 2.0}  # fmt: skip
+    (text,) = warnings_of(body=bone, diagnostics=stress)
+    assert text.startswith("body: the fillet of radius 2 lattice units has 4 lattice constants")
+
+
 def test_distant_point_is_named_with_group_particle_and_distance() -> None:
     nearest = {"nearest": [[4.0, 2.0], [7.0, 6.0]]}
     select = [{"select": nearest, "motion": HOLD}]
