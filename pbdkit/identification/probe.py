@@ -72,6 +72,8 @@ class RuleProperties:
     reasons
         Reasons why the rule is neither diffusion nor elasticity, apart from the response to long
         waves.
+    differentiable
+        Whether the move is linear in small displacements.
     linear
         Whether the move is linear in finite displacements.
     turns
@@ -84,6 +86,7 @@ class RuleProperties:
 
     stencil: Stencil
     reasons: tuple[str, ...]
+    differentiable: bool
     linear: bool
     turns: bool
     symmetric: bool
@@ -101,6 +104,7 @@ def probe(scene: Scene, spacing: float) -> RuleProperties:
     return RuleProperties(
         next(iter(stencils.values())),
         tuple(_reasons(scene, cases, stencils, spacing)),
+        _is_differentiable(cases, spacing),
         all(_is_linear(rule, place, AMPLITUDE * spacing, ROUNDING) for rule, place in cases),
         all(_commutes_with_rotation(rule, place, spacing) for rule, place in cases),
         all(_is_symmetric(stencil) for stencil in stencils.values()),
@@ -116,12 +120,17 @@ def _reasons(
     drift = max(_move_at_rest(rule, place) for rule, place in cases) / spacing
     if not drift <= STILL:
         yield f"a body at rest does not remain at rest: the rule moves it by {drift:.6g} h per step"
-    if not all(_is_linear(rule, place, SMALL * spacing, STRAIGHT) for rule, place in cases):
+    if not _is_differentiable(cases, spacing):
         yield (
             "arbitrarily small displacements do not superpose: the rule is not differentiable at "
-            "rest, and has no plane waves"
+            "rest, and has no plane waves; a table with a corner at the distance of a neighbour "
+            "has this effect: move the point"
         )
     yield from _place_dependence(scene, stencils)
+
+
+def _is_differentiable(cases: list[tuple[Scene, Here]], spacing: float) -> bool:
+    return all(_is_linear(rule, place, SMALL * spacing, STRAIGHT) for rule, place in cases)
 
 
 def _single_rules(scene: Scene) -> list[Scene]:
@@ -257,6 +266,8 @@ def identified(scene: Scene) -> Identity:
     _refuse_no_numbers(response.stencil, experiment.rule.type)
     stencil, degree = primitive(cell, response.stencil), len(scene.neighbourhood.slots[0])
     long_waves, reasons_of_waves = _long_waves(stencil)
+    if long_waves is None and not response.differentiable:
+        reasons_of_waves = []  # They would follow from derivatives that do not exist.
     reasons = (*response.reasons, *reasons_of_waves)
     kind = ELASTICITY if long_waves is not None and long_waves.diffusivity is None else DIFFUSION
     identity = Identity(

@@ -33,8 +33,6 @@ from pbdkit.plugin.vector import vector
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.rule_evaluation import Evaluator
 
-NO_REMEDY = "; no relaxation makes it stable: check the rule, and keep |memory| below 1"
-"""End of the message about a bound if no relaxation is stable."""
 TINY = 1e-100
 """Imaginary step of derivatives, as a fraction of the spacing."""
 
@@ -198,6 +196,22 @@ def _after(first: Slot, second: Slot) -> Slot:
     cell, site = map(add, first.cell, second.cell), map(add, first.site, second.site)
     rest, shell = first.rest + second.rest, first.shell + second.shell
     return Slot(first.source, second.target, tuple(cell), tuple(site), rest, shell)
+
+
+def stability_remedy(bound: float | None, memory: float) -> str:
+    """Return the end of a message about divergence.
+
+    Parameters
+    ----------
+    bound
+        Largest stable relaxation; None if no relaxation is stable.
+    memory
+        Momentum of the solver.
+    """
+    if bound:
+        return f"; it is stable below {bound:.4g}"
+    momentum = ", and keep |memory| below 1" if memory else ""
+    return f"; no relaxation makes it stable: check the rule{momentum}"
 
 
 WAVES = 48

@@ -37,7 +37,7 @@ from pbdkit.linear.spectrum import (
     spectrum,
     spectrum_of,
 )
-from pbdkit.linear.stencil import NO_REMEDY, bounds_the_body, wave_bound
+from pbdkit.linear.stencil import bounds_the_body, stability_remedy, wave_bound
 from pbdkit.memory import machine_memory
 from pbdkit.plugin import Anchors
 from pbdkit.progress import Watch
@@ -491,7 +491,7 @@ class Analysis:
             return []  # Steps with that relaxation would also converge to equilibrium.
         if self.stable is False:
             bound = self.largest_stable_relaxation
-            remedy = f"; it is stable below {bound:.4g}" if bound else NO_REMEDY
+            remedy = stability_remedy(bound, self.scene.experiment.stepping.memory)
             return [
                 f"solver.relaxation: {self.scene.experiment.stepping.relaxation:g} diverges, the "
                 f"spectral radius is {self.spectral_radius:.6g}{remedy}"

@@ -29,7 +29,7 @@ from pbdkit.errors import (
 from pbdkit.lattice.neighbourhood import count_bonds
 from pbdkit.lattice.raster import FOLLOWER
 from pbdkit.linear.spectrum import NEUTRAL
-from pbdkit.linear.stencil import NO_REMEDY, Bound, bounds_the_body, wave_bound
+from pbdkit.linear.stencil import Bound, bounds_the_body, stability_remedy, wave_bound
 from pbdkit.memory import machine_memory
 from pbdkit.model.motions import Newton
 from pbdkit.plugin import Anchors, Calibrated
@@ -308,7 +308,7 @@ def _growing_waves(scene: Scene, bound: Bound | None) -> list[str]:
     stable = bound.largest_stable_relaxation(solver.memory)
     if stable and not scene.experiment.solver.makes_steps:
         return []
-    remedy = f"; it is stable below {stable:.4g}" if stable else NO_REMEDY
+    remedy = stability_remedy(stable, solver.memory)
     grows = f"can diverge, since some waves grow by {bound.radius:.4g} per step"
     text = f"solver.relaxation: {solver.relaxation:g} {grows}{remedy}"
     return [WarningText(text, StabilityWarning)]

@@ -593,9 +593,11 @@ def keeps_single_precision(subject: Subject) -> None:
         for name, value in flat(call.evaluate(_single)).items():
             kind = getattr(value, "dtype", None)
             if kind is not None and kind.kind == "f" and kind != np.float32:
+                of_slot = "; compute what depends on r alone, such as `length(r)`, in `weights`"
                 raise PropertyError(
                     f"`{call.function}` returns {kind} for float32 ({name}); set no dtype, and "
                     "convert parameters and constants to plain numbers by `float(...)`"
+                    + (of_slot if call.function.startswith("gather") else "")
                 )
 
 

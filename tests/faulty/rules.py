@@ -75,6 +75,17 @@ class Doubles(Sound):
         return np.float64(0.5) * total[0]
 
 
+class GathersDoubles(Sound):
+    """Divides by a distance at rest, which numpy computes in double precision."""
+
+    type: Literal["gathers-doubles"] = "gathers-doubles"
+
+    @staticmethod
+    def gather(d, r, w, p):
+        far = pbdkit.plugin.length(r)
+        return d / far, 1.0 / far
+
+
 class LooksAround(Sound):
     """Moves every particle by the mean of all."""
 

@@ -1,6 +1,7 @@
 """Results and texts of `pbdkit identify` for rules and lattices of third parties."""
 
 import json
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from remembering_parts import Tiring
 
 import pbdkit
 from pbdkit.identification.elastic_constants import Elasticity
+from pbdkit.plugin import FollowerRule, Table, interpolate, length
 
 HONEYCOMB = {"type": "honeycomb"}
 
@@ -107,7 +109,8 @@ def test_lattice_scale_changes_nothing():
         (
             "bent",
             ("arbitrarily small displacements do not superpose: the rule is not differentiable at "
-            "rest, and has no plane waves"),
+            "rest, and has no plane waves; a table with a corner at the distance of a neighbour "
+            "has this effect: move the point"),
         ),
         (
             "idle",
@@ -129,6 +132,29 @@ def test_unclassified_rule_has_a_reason(rule, reason):
     assert (found.kind, found.symmetry, found.poisson_ratio) == ("neither", None, None)
     assert reason in found.reasons
     json.dumps(found.as_dict())
+
+
+class Cornered(FollowerRule):
+    """Preserves translations; its table has a corner at the distance of the nearest neighbours."""
+
+    type: Literal["cornered"] = "cornered"
+    law: Table = Table([(0.0, 1.0), (1.0, 1.0), (2.0, 0.5)])
+
+    @staticmethod
+    def gather(d, r, w, p):
+        return interpolate(length(r + d), p.law) * (r + d), 1.0
+
+    @staticmethod
+    def apply(total, here, p):
+        return total[0] / total[1]
+
+
+def test_translations_are_not_blamed_for_a_corner_of_a_table():
+    settings = ["rule={type: cornered}"]
+    found = pbdkit.identify(pbdkit.load("paper/a", components=[Cornered], settings=settings))
+    (reason,) = found.reasons
+    assert "not differentiable" in reason
+    assert reason.endswith("move the point")
 
 
 def test_immobile_sites_are_not_one_body():

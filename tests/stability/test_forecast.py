@@ -20,7 +20,7 @@ from property_cases import (
 from scene_strategies import AT_LENGTH, lattices, neighbours
 
 import pbdkit
-from pbdkit.linear.stencil import wave_bound
+from pbdkit.linear.stencil import stability_remedy, wave_bound
 from pbdkit.stability.analysis import Analysis
 from pbdkit.stability.forecast import prediction
 from pbdkit.stepping.numpy_engine import Stepper
@@ -197,3 +197,9 @@ def test_run_predicts_nothing_if_waves_do_not_bound_the_body():
         assert prediction(scene, bound)["stable"] is promise
     scene = scene_of(frame={"type": "mean"}, **parts | {"solver": {"type": "stepping"}})
     assert prediction(scene, wave_bound(scene))["stable"] is True
+
+
+def test_remedy_mentions_memory_only_if_there_is_memory():
+    assert "memory" not in stability_remedy(None, 0.0)
+    assert "keep |memory| below 1" in stability_remedy(None, 1.1)
+    assert stability_remedy(1.5, 0.5) == "; it is stable below 1.5"

@@ -65,6 +65,7 @@ FAULTS = [
     (rules.CountsPlaces, "takes-particles-in-any-order", "if the particles are in another order"),
     (rules.SumsInOrder, "takes-particles-in-any-order", "order in which neighbours are summed"),
     (rules.Doubles, "keeps-single-precision", "`apply` returns float64 for float32"),
+    (rules.GathersDoubles, "keeps-single-precision", "such as `length(r)`, in `weights`"),
     (rules.LooksAround, "is-local", "alone and among others"),
     (rules.NeedsArrays, "is-local", "fails with plain numbers instead of arrays"),
     (rules.Remembers, "remembers-nothing", "changes `SEEN` between calls"),
