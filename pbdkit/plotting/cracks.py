@@ -183,7 +183,9 @@ def _map(dataset: xarray.Dataset, broken: CrackBonds, title: str, ax: Axes | Non
             ax.add_collection(lines, autolim=False)
     if len(later) > 1:
         _coloured(ax, broken, below=_is_long(body))
-    units = dataset["reference"].attrs.get("units", "")
+    factor, units = in_its_units(dataset["reference"].attrs)
+    for scaled in (ax.xaxis, ax.yaxis):
+        scaled.set_major_formatter(lambda place, _: f"{factor * place:.6g}")
     x, y = (label(axis, units, width=BROAD) for axis in "xy")
     ax.set(aspect="equal", title=label(title, width=BROAD), xlabel=x, ylabel=y)
     ax.margins(0.04)

@@ -82,6 +82,11 @@ def _listed(value: Any) -> tuple[Any, ...]:
     """Return the values of one parameter."""
     value = plain(value)
     if isinstance(value, dict):
+        if any(isinstance(value.get(end), str) for end in ("from", "to")):
+            raise fault(
+                "`from` and `to` of a range are numbers without units; list values with units, "
+                "for example [6 mm, 10 mm, 14 mm]"
+            )
         value = Range.model_validate(value).values()
     if not isinstance(value, list) or not value:
         raise fault(f"expected a list of values or {{from, to, count}}, got {brief(value)}")

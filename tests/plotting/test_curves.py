@@ -415,6 +415,16 @@ def test_members_are_labelled_by_the_types_of_their_components():
 # Cracks
 
 
+def test_axes_of_a_crack_are_in_mm_with_units(torn):
+    scaled = torn.copy()
+    scaled["reference"].attrs |= {"physical_units": "mm", "physical_factor": 2.0}
+    ax = scaled.pbd.crack()
+    ax.figure.canvas.draw()
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("x (mm)", "y (mm)")
+    texts = [float(text.get_text()) for text in ax.get_xticklabels()]
+    np.testing.assert_allclose(texts, 2.0 * ax.get_xticks())
+
+
 def test_crack_is_drawn_as_its_broken_bonds(torn):
     ax = torn.pbd.crack()
     old, new = sorted(ax.collections, key=lambda c: c.get_array() is not None)

@@ -430,6 +430,8 @@ WRONG = [
     ({"vary": {"steps": 5}}, "vary.steps: expected a list of values"),
     ({"vary": {"steps": [2, 2]}}, "vary.steps: 2 is listed twice"),
     ({"vary": {"steps": {"from": 1, "to": 2}}}, "vary.steps.count: is missing"),
+    ({"vary": {"body.width": {"from": "6 mm", "to": "14 mm", "count": 3}}},
+     "vary.body.width: `from` and `to` of a range are numbers without units; list values with"),
     ({"vary": {"steps": {"from": 1, "til": 2, "count": 2}}}, "did you mean 'to'|unknown key"),
     ({"vary": {"solver.relaxation": {"from": 0, "to": 2, "count": 2, "scale": "log"}}}, "above 0"),
     ({"vary": {"rule": [{"type": "barycentre"}], "rule.K": [1]}}, "'rule' is varied twice"),
