@@ -50,7 +50,7 @@ MORE = """\
     invoke_without_command=True,
     epilog='In bash, `eval "$(_PBDKIT_COMPLETE=bash_source pbdkit)"` enables completion of '
     "commands, settings, variables and steps with the Tab key; for zsh and fish see "
-    'the page "Experiments" of the documentation.',
+    'the page "Write and run experiment files" of the documentation.',
 )
 @click.option("--debug", is_flag=True, help="Show a traceback if a command fails.")
 @click.option("--version", is_flag=True, help="Print the version.")
