@@ -20,10 +20,10 @@ FAULTY = "faulty"
 def refuse_other_file(path: Path) -> None:
     """Raise ExperimentError if a path leads to a file that is certainly not a result, and
     StorageError if there is not even its folder."""
-    if not path.parent.is_dir():
-        raise StorageError(f"{path}: there is no such file")
     if description := other_file(path):
         raise ExperimentError(f"{path}: {description}")
+    if not path.parent.is_dir():
+        raise StorageError(f"{path}: there is no such file")
 
 
 def other_file(path: Path) -> str:

@@ -90,6 +90,8 @@ def open_read_only(path: Path, closing: contextlib.ExitStack) -> sqlite3.Connect
     try:
         connection.execute("BEGIN")
         connection.execute("SELECT COUNT(*) FROM sqlite_master").fetchone()
+    except UnicodeDecodeError as error:  # A message of SQLite quotes damaged bytes.
+        raise sqlite3.DatabaseError(f"the schema is damaged: {error}") from error
     except sqlite3.OperationalError as error:
         if error.sqlite_errorcode != sqlite3.SQLITE_READONLY_ROLLBACK:
             raise
