@@ -7,11 +7,12 @@ outline are therefore included in spite of rounding errors (docs/model.md, secti
 from __future__ import annotations
 
 import math
+import operator
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,12 +23,17 @@ from pbdkit.model.validation import closed_part
 from pbdkit.plugin import Component
 from pbdkit.plugin.units import LENGTH, Place
 
+if TYPE_CHECKING:
+    from shapely import Geometry
+
 Count = Annotated[int, Field(ge=1, le=2**31)]
 """Type of a number of sites along an axis."""
 Positive = Annotated[float, Field(gt=0.0, le=1e100), LENGTH]
 """Type of a positive length."""
 Vertices = Annotated[tuple[Place, ...], Field(strict=False, min_length=3, max_length=100_000)]
 """Type of the vertices of a polygon."""
+ARC_SIDES = 45
+"""Number of straight sides by which a quarter of a circle is approximated in areas."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +71,11 @@ class Body(Component):
         sites
             Sites at which the distance is evaluated.
         """
+
+    def area(self) -> Geometry | None:
+        """Return the area within the outline for pictures, with polygons in place of arcs. Return
+        None if the body has no outline."""
+        return None
 
     def exaggerates(self) -> bool:
         """Return whether `distance` can exceed the distance from the outline."""
@@ -108,6 +119,10 @@ class Rectangle(Body):
         x, y = self.origin
         return [Box((x, y), (x + self.width, y + self.height))]
 
+    def area(self) -> Geometry:
+        """Return the rectangle."""
+        return _box(*self.boxes())
+
     def distance(self, sites: Sites) -> Floats:
         """Return the larger of the signed distances along x and y.
 
@@ -127,6 +142,10 @@ class Disc(Body):
     def boxes(self) -> list[Box]:
         """Return the square around the disc."""
         return [_square(self.centre, self.radius)]
+
+    def area(self) -> Geometry:
+        """Return the disc."""
+        return _disc(self.centre, self.radius)
 
     def distance(self, sites: Sites) -> Floats:
         """Return the distance from the centre minus the radius."""
@@ -151,6 +170,10 @@ class Ring(Body):
         """Return the square around the ring."""
         return [_square(self.centre, self.outer)]
 
+    def area(self) -> Geometry:
+        """Return the outer disc without the inner one."""
+        return _disc(self.centre, self.outer) - _disc(self.centre, self.inner)
+
     def distance(self, sites: Sites) -> Floats:
         """Return the signed distance from the nearer circle."""
         r = _from(self.centre, sites)
@@ -169,13 +192,14 @@ class Polygon(Body):
 
         if max(abs(c) for vertex in self.vertices for c in vertex) > 1e100:
             raise ValueError("a vertex lies beyond 1e100")
-        outline = self._outline()
+        outline = self.area()
         if not outline.is_valid or outline.area == 0.0:
             reason = "no area" if outline.is_valid else explain_validity(outline)
             raise ValueError(f"the polygon is not simple: {reason}")
         return self
 
-    def _outline(self) -> Any:
+    def area(self) -> Geometry:
+        """Return the polygon."""
         from shapely import Polygon as Outline
 
         return Outline(self.vertices)
@@ -189,7 +213,7 @@ class Polygon(Body):
         """Return the signed distance from the boundary, negative inside."""
         import shapely
 
-        outline = self._outline()
+        outline = self.area()
         shapely.prepare(outline)
         inside = shapely.contains_xy(outline, *sites.at)
         to_boundary = shapely.distance(outline.boundary, shapely.points(*sites.at))
@@ -235,6 +259,24 @@ class Dogbone(Body):
         x, y = self.origin
         return [Box((x, y), (x + self.length, y + self.width))]
 
+    def area(self) -> Geometry:
+        """Return the box without the parts beside the gauge, of which the corners are rounded."""
+        from shapely import box
+
+        (left, low), far = self.origin, 2 * self.width
+        x, y = left + self.length / 2, low + self.width / 2
+        start, end = x - self.gauge_length / 2, x + self.gauge_length / 2
+        near = self.gauge_width / 2 + self.radius
+        beside = (
+            box(start, y + near, end, y + near + far),
+            box(start, y - near - far, end, y - near),
+        )
+        return reduce(
+            lambda area, part: area - part.buffer(self.radius, quad_segs=ARC_SIDES),
+            beside,
+            _box(*self.boxes()),
+        )
+
     def distance(self, sites: Sites) -> Floats:
         """Return the distance along y from the outline, or the distance beyond the ends."""
         (x, y), (left, low) = sites.at, self.origin
@@ -256,6 +298,18 @@ def _square(centre: Place, radius: float) -> Box:
     return Box((x - radius, y - radius), (x + radius, y + radius))
 
 
+def _box(box: Box) -> Geometry:
+    from shapely import box as rectangle
+
+    return rectangle(*box.low, *box.high)
+
+
+def _disc(centre: Place, radius: float) -> Geometry:
+    from shapely import Point
+
+    return Point(centre).buffer(radius, quad_segs=ARC_SIDES)
+
+
 def _from(centre: Place, sites: Sites) -> Floats:
     x, y = sites.at
     distance: Floats = np.hypot(x - centre[0], y - centre[1])
@@ -267,6 +321,13 @@ class Composed(Body):
 
     of: Bodies
 
+    _compose: ClassVar[Callable[[Any, Any], Any]]
+
+    def area(self) -> Geometry | None:
+        """Return the composition of the areas of all parts, or None if one has no outline."""
+        areas = [area for part in self.of if (area := part.area()) is not None]
+        return reduce(self._compose, areas) if len(areas) == len(self.of) else None
+
     def exaggerates(self) -> bool:
         """Return whether the distance of a part can exceed the distance from its outline."""
         return any(part.exaggerates() for part in self.of)
@@ -276,6 +337,8 @@ class Union(Composed):
     """Union of several bodies."""
 
     type: Literal["union"] = "union"
+
+    _compose: ClassVar[Callable[[Any, Any], Any]] = operator.or_
 
     def boxes(self) -> list[Box]:
         """Return the boxes of all parts."""
@@ -290,6 +353,8 @@ class Intersection(Composed):
     """Intersection of several bodies."""
 
     type: Literal["intersection"] = "intersection"
+
+    _compose: ClassVar[Callable[[Any, Any], Any]] = operator.and_
 
     def boxes(self) -> list[Box]:
         """Return the box of a grid if one is a part, otherwise the intersection of the boxes of all
@@ -315,6 +380,8 @@ class Difference(Composed):
     """First body without all others. Sites on the outline of the others belong to it."""
 
     type: Literal["difference"] = "difference"
+
+    _compose: ClassVar[Callable[[Any, Any], Any]] = operator.sub
 
     def boxes(self) -> list[Box]:
         """Return the boxes of the first part."""

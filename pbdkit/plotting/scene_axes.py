@@ -41,11 +41,10 @@ class AxesCanvas:
         colour: str,
         *,
         square: bool = False,
-        opacity: float = 1.0,
     ) -> None:
         """Draw dots of one size."""
         style: dict[str, Any] = {"ls": "", "marker": "s" if square else "o", "mew": 0.0}
-        self._plot(places, color=colour, ms=POINTS * size, alpha=opacity, **style)
+        self._plot(places, color=colour, ms=POINTS * size, **style)
 
     def line(self, places: Floats, colour: str, width: float, dashes: str = "") -> None:
         """Draw a polyline. `dashes` has the same form as in SVG."""
@@ -53,14 +52,15 @@ class AxesCanvas:
         style: Any = (0.0, lengths) if lengths else "-"
         self._plot(places, color=colour, lw=POINTS * width, ls=style)
 
-    def filled(self, outlines: list[Floats], fill: str, edge: str) -> None:
+    def filled(self, outlines: list[Floats], fill: str, edge: str, *, opacity: float = 1.0) -> None:
         """Fill the area between closed outlines. An outline inside another one is the edge of a
         hole."""
         turned = [line[:: 1 if n == 0 else -1] for n, line in enumerate(outlines)]
         path = Path.make_compound_path(
             *(Path(self._unit * o, closed=False) for o in map(_closed, turned))
         )
-        self._ax.add_patch(PathPatch(path, fc=fill, ec=edge, lw=POINTS, zorder=self._next))
+        face = (fill, opacity)
+        self._ax.add_patch(PathPatch(path, fc=face, ec=edge, lw=POINTS, zorder=self._next))
 
     def arrow(self, tail: Floats, vector: Floats, colour: str) -> None:
         """Draw an arrow that starts at a place. `vector` is in pixels, with y upward."""

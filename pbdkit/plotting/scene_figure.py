@@ -12,6 +12,7 @@ from html import escape
 from typing import Any, Protocol
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from pbdkit.array_types import Floats
@@ -57,14 +58,13 @@ class Svg:
         colour: str,
         *,
         square: bool = False,
-        opacity: float = 1.0,
     ) -> None:
         """Draw dots of one size, in pixels. They are drawn as one path, because many elements would
         be slow."""
         path = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in self.at(places))
         cap = "square" if square else "round"
         style = f'stroke="{colour}" stroke-width="{size:.2f}" stroke-linecap="{cap}"'
-        self._add(f'<path d="{path}" {style} stroke-opacity="{opacity:g}"/>' if path else "")
+        self._add(f'<path d="{path}" {style}/>' if path else "")
 
     def line(self, places: Floats, colour: str, width: float, dashes: str = "") -> None:
         """Draw a polyline; `dashes` as in SVG."""
@@ -73,10 +73,10 @@ class Svg:
         style = f'fill="none" stroke="{colour}" stroke-width="{width:g}" stroke-linecap="round"'
         self._add(f'<path d="{path}" {style}{dashed}/>')
 
-    def filled(self, outlines: list[Floats], fill: str, edge: str) -> None:
+    def filled(self, outlines: list[Floats], fill: str, edge: str, *, opacity: float = 1.0) -> None:
         """Fill the area between closed outlines: an inner one is a hole."""
         parts = ("M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in self.at(o)) + "Z" for o in outlines)
-        style = f'fill="{fill}" stroke="{edge}" fill-rule="evenodd"'
+        style = f'fill="{fill}" stroke="{edge}" fill-opacity="{opacity:g}" fill-rule="evenodd"'
         self._add(f'<path d="{"".join(parts)}" {style}/>')
 
     def arrow(self, tail: Floats, vector: Floats, colour: str) -> None:
@@ -153,6 +153,12 @@ ARROW_SPACING_PX = 14.0
 """Distance between arrows in pixels."""
 BODY_COLOUR = "#0072B2"
 """Colour of the body."""
+BODY_FILL = "#E3EDF4"
+"""Colour of the area of the body."""
+OUTSIDE_COLOUR = "#99BFD9"
+"""Colour of particles of the body that lie outside its outline, at corners of cut cells."""
+REGION_OPACITY = 0.45
+"""Opacity of the fill of a region."""
 OUTLINE_COLOUR = "#5A87A8"
 """Colour of the edge of the body."""
 FRAME_COLOUR = "#DCCB2E"
@@ -169,12 +175,14 @@ OBSTACLE_COLOUR = "#9A9A9A"
 """Colour of the outlines of obstacles."""
 OBSTACLE_ARROW_COLOUR = "#404040"
 """Colour of the arrows of moving obstacles."""
+OUTSIDE = "body, outside the outline"
+"""Meaning of the colour of particles outside the outline."""
 REGION_COLOURS = ("#E69F00", "#56B4E9", "#CC79A7", "#009E73", "#F0E442", "#0072B2")
 """Colours of the regions of a body."""
 MAX_PARTICLES = 3000
 """Maximum number of particles up to which all particles of a body are drawn."""
-MAX_REGION_DOTS = 1500
-"""Maximum number of dots that are drawn in a region."""
+OUTLINE_PX = 0.1
+"""Distance in pixels by which a simplified outline may deviate from the true one."""
 MAX_ARROWS = 5
 """Maximum number of arrows that are drawn for a group."""
 OBSTACLE_MARGIN = 0.35
@@ -195,16 +203,14 @@ class Canvas(Protocol):
     low: Floats
     high: Floats
 
-    def dots(
-        self, places: Floats, size: float, colour: str, *, square: bool = ..., opacity: float = ...
-    ) -> None:
+    def dots(self, places: Floats, size: float, colour: str, *, square: bool = ...) -> None:
         """Draw dots of one size."""
 
     def line(self, places: Floats, colour: str, width: float, dashes: str = ...) -> None:
         """Draw a polyline through places."""
 
-    def filled(self, outlines: list[Floats], fill: str, edge: str) -> None:
-        """Fill the area between closed outlines: an inner one is a hole."""
+    def filled(self, outlines: list[Floats], fill: str, edge: str, *, opacity: float = ...) -> None:
+        """Fill the area between closed outlines. The first contains the others, which are holes."""
 
     def arrow(self, tail: Floats, vector: Floats, colour: str) -> None:
         """Draw an arrow from a place, by a vector in pixels, y up."""
@@ -259,44 +265,61 @@ class _Drawing:
         self.scene, self.canvas, self.legend = scene, canvas, list[tuple[str, str]]()
         self.X = scene.raster.reference()
         self.body = scene.raster.table_kind == FOLLOWER
+        self.area = scene.experiment.body.area()
+        self.outside = np.zeros_like(self.body)
+        if self.area is not None:
+            outside = signed_distance(scene.experiment.body, scene.raster.cell, *self.X.T) > 0.0
+            self.outside = self.body & outside
         self.few, places = _is_small(scene), _shown(scene)
         self.middle = (places.min(axis=0) + places.max(axis=0)) / 2
         self.dot = min(max(0.5 * spacing(scene.raster) * canvas.scale, 1.2), 7.0)
 
     def draw(self) -> None:
         """Draw from the lowest to the topmost layer."""
-        self._regions()
+        self._areas()
         self._obstacles()
         if self.few:
-            self._draw_named(
-                self.canvas.dots, self.X[~self.body], 0.6 * self.dot, FRAME_COLOUR, "frame"
-            )
-        rows = self.body if self.few else edge_of(self.scene.raster)
-        colour, text = (BODY_COLOUR, "body") if self.few else (OUTLINE_COLOUR, "edge of the body")
-        self._draw_named(self.canvas.dots, self.X[rows], self.dot, colour, text)
+            self._draw_named(self.X[~self.body], 0.6 * self.dot, FRAME_COLOUR, "frame")
+            self._draw_named(self.X[self.outside], self.dot, OUTSIDE_COLOUR, OUTSIDE)
+            self._draw_named(self.X[self.body & ~self.outside], self.dot, BODY_COLOUR, "body")
+        elif self.area is None:
+            edge = self.X[edge_of(self.scene.raster)]
+            self._draw_named(edge, self.dot, OUTLINE_COLOUR, "edge of the body")
         self._cuts()
         self._leaders()
         self._loads()
 
-    def _draw_named(self, draw: Any, places: Floats, size: float, colour: str, text: str) -> None:
+    def _draw_named(self, places: Floats, size: float, colour: str, text: str) -> None:
         if len(places):
-            draw(places, size, colour)
+            self.canvas.dots(places, size, colour)
             self._note(colour, text)
 
     def _note(self, colour: str, text: str) -> None:
         if (colour, text) not in self.legend:
             self.legend.append((colour, text))
 
-    def _regions(self) -> None:
-        cell = self.scene.raster.cell
-        at = self.X[self.body]
+    def _areas(self) -> None:
+        """Fill the body and its regions. A body without an outline has no area of its own, and its
+        regions are cropped at its bounding box."""
+        if self.area is not None:
+            self._fill(self.area, BODY_FILL, OUTLINE_COLOUR)
+            if not self.few:
+                self._note(OUTLINE_COLOUR, "body")
+        at, room = self.X[self.body], spacing(self.scene.raster) / 2
+        whole = self.area or shapely.box(*at.min(axis=0) - room, *at.max(axis=0) + room)
         for n, (name, shape) in enumerate(self.scene.experiment.regions.items()):
-            inside = at[signed_distance(shape, cell, *at.T) <= 0.0]
-            step = 1 + len(inside) // MAX_REGION_DOTS
-            size = spacing(self.scene.raster) * self.canvas.scale * math.sqrt(step)
             colour = REGION_COLOURS[n % len(REGION_COLOURS)]
-            self.canvas.dots(inside[::step], size, colour, square=True, opacity=0.45)
+            if (area := shape.area()) is not None:
+                self._fill(area & whole, colour, colour, REGION_OPACITY)
             self._note(colour, f"region {name}")
+
+    def _fill(self, area: shapely.Geometry, fill: str, edge: str, opacity: float = 1.0) -> None:
+        """Fill each connected part of an area."""
+        for part in shapely.get_parts(area.simplify(OUTLINE_PX / self.canvas.scale)):
+            if part.geom_type == "Polygon":
+                holes = (ring.coords[::-1] for ring in part.interiors)
+                rings = [np.array(ring)[:, :2] for ring in (part.exterior.coords, *holes)]
+                self.canvas.filled(rings, fill, edge, opacity=opacity)
 
     def _obstacles(self) -> None:
         for barrier in self.scene.barriers:

@@ -5,8 +5,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import shapely
 
 import pbdkit
+from pbdkit.model.bodies import Sites
+from pbdkit.plugin import Vector
 from pbdkit.scene.scene import build_scene
 
 HOLD = {"motion": {"type": "hold"}}
@@ -53,6 +56,42 @@ def test_a_far_body_is_the_same_body():
     origin = {"type": "square", "a": 1.0, "origin": [1e6, -1e6]}
     near = body_sites({"type": "disc", "radius": 2.0, "centre": [0, 0]})
     assert body_sites(far, lattice=origin) == near
+
+
+PARTS = {
+    "rectangle": {"width": 4.0, "height": 3.0, "origin": [0.5, 1.0]},
+    "disc": {"radius": 2.0, "centre": [3.0, 2.5]},
+    "ring": {"inner": 1.0, "outer": 2.0, "centre": [3.0, 2.5]},
+    "polygon": {"vertices": [[0.0, 0.0], [5.0, 1.0], [3.0, 4.0]]},
+    "dogbone": {
+        "length": 6.0, "width": 5.0, "gauge_length": 2.0, "gauge_width": 1.0, "radius": 1.0
+    },
+    "dogbone with flat fillets": {
+        "length": 6.0, "width": 3.0, "gauge_length": 1.0, "gauge_width": 1.5, "radius": 3.0
+    },
+}  # fmt: skip
+OUTLINES = [{"type": name.split()[0], **part} for name, part in PARTS.items()]
+COMPOSED = [
+    {"type": name, "of": [OUTLINES[0], OUTLINES[1], OUTLINES[3]]}
+    for name in ("union", "intersection", "difference")
+]
+
+
+@pytest.mark.parametrize("body", OUTLINES + COMPOSED, ids=lambda body: body["type"])
+def test_area_is_where_the_distance_is_negative(body):
+    body = pbdkit.Experiment(**scene(body=body)).body
+    at = Vector(*np.random.default_rng(1).uniform(-0.5, 6.5, (2, 4000)))
+    away = body.distance(Sites((np.zeros(4000, int),) * 2, at))
+    clear = np.abs(away) > 1e-3
+    assert clear.sum() > 3900
+    inside = shapely.contains_xy(body.area(), *at)
+    np.testing.assert_array_equal(inside[clear], away[clear] < 0.0)
+    assert 0 < inside.sum() < 4000
+
+
+def test_body_with_a_grid_has_no_area():
+    grid = {"type": "difference", "of": [GRID, PARTS["disc"] | {"type": "disc"}]}
+    assert pbdkit.Experiment(**scene(body=grid)).body.area() is None
 
 
 GRID = {"type": "grid", "columns": 5, "rows": 4}

@@ -71,6 +71,21 @@ def test_legend_lists_the_contents_of_the_scene():
     assert "frame" in [words for _, words in framed]
 
 
+def test_areas_of_body_and_region_have_their_true_outlines():
+    drawing = picture_of(build_scene(pbdkit.load("modelling/composite-plate")))
+    assert {"region steel", "body", "body, outside the outline"} <= {w for _, w in drawing.legend}
+    filled = [s for s in ElementTree.fromstring(drawing.svg) if s.get("fill-rule")]
+    body, steel = (
+        [numbers({"d": ring}).reshape(-1, 2) for ring in s.get("d").split("Z")[:-1]] for s in filled
+    )
+    (plate, hole), (inclusion,) = body, steel
+    scale = np.ptp(plate[:, 0]) / 60.0
+    for ring, centre, radius in ((hole, (18.0, 20.0), 6.0), (inclusion, (42.0, 20.0), 8.0)):
+        at = (ring - [plate[:, 0].min(), plate[:, 1].max()]) / [scale, -scale]
+        np.testing.assert_allclose(np.hypot(*(at - centre).T), radius, atol=0.15 / scale)
+        assert len(ring) > 12
+
+
 UNITS = {"units": {"length": "2 mm"}}
 
 
