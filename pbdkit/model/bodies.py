@@ -326,7 +326,7 @@ class Composed(Body):
     def area(self) -> Geometry | None:
         """Return the composition of the areas of all parts, or None if one has no outline."""
         areas = [area for part in self.of if (area := part.area()) is not None]
-        return reduce(self._compose, areas) if len(areas) == len(self.of) else None
+        return reduce(type(self)._compose, areas) if len(areas) == len(self.of) else None
 
     def exaggerates(self) -> bool:
         """Return whether the distance of a part can exceed the distance from its outline."""
