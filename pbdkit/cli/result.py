@@ -15,7 +15,7 @@ import numpy as np
 from pbdkit.cli.output import refuse_output
 from pbdkit.errors import ExperimentError, PbdkitError, StorageError
 from pbdkit.io import vtkhdf
-from pbdkit.io.explain import BondRecords, BondStatus
+from pbdkit.io.explain import PLACES, BondRecords, BondStatus
 from pbdkit.io.layout import scene_of
 from pbdkit.io.open import reading
 from pbdkit.io.other_files import refuse_other_file
@@ -45,12 +45,15 @@ def explain(file: Path, bond: tuple[int, int] | None, at: dict[str, str], as_jso
 
 def _run_facts(explained: BondRecords) -> dict[str, Any]:
     steps = explained.steps
+    is_broken = (steps > 0) & ~explained.cut
+    by_place = np.bincount(explained.places[is_broken], minlength=len(PLACES))
     return {
         "fracture": explained.model.type,
         "bonds": len(steps),
-        "broken": int((steps > 0).sum() - explained.cut.sum()),
+        "broken": int(is_broken.sum()),
         "cut": int(explained.cut.sum()),
         "broken_from_the_start": int((steps == 0).sum()),
+        "broken_by_place": dict(zip(PLACES, by_place.tolist(), strict=True)),
         "in_order": explained.statuses(explained.order),
         "nearest": explained.nearest(),
     }
@@ -75,6 +78,12 @@ def _run_in_words(facts: dict[str, Any]) -> Iterator[str]:
     further = {"cut": facts["cut"], "broken from the start": facts["broken_from_the_start"]}
     rest = "".join(f", {count} {kind}" for kind, count in further.items() if count)
     yield f"fracture {model}: {broken} of {facts['bonds']} bonds broke{rest}"
+    by_place = facts["broken_by_place"]
+    if by_place["body"] < broken:
+        yield (
+            f"of these {by_place['body']} in the body, {by_place['outside the outline']} with an "
+            f"end outside its outline, and {by_place['frame']} with an end in the frame"
+        )
     rows = [status for status in facts["in_order"] if status.state == "broken"]
     if rows:
         yield f"first in step {rows[0].step}, last in step {rows[-1].step}"
@@ -82,7 +91,8 @@ def _run_in_words(facts: dict[str, Any]) -> Iterator[str]:
     for status in rows[:MAX_LISTED]:
         strain, limit = _number(status.strain_at_break), _number(status.breaks_above)
         position = f"{status.order:>5}  {status.step:>4}  {_name(status):<13}"
-        yield f"{position}  {strain:<11}  {limit}"
+        place = "" if status.place == "body" else f"  {status.place}"
+        yield f"{position}  {strain:<11}  {limit}{place}"
     if rows and all(status.breaks_above is None for status in rows):
         remedy = "a fracture model declares it by `breaking_strain`"
         yield f"{model} declares no strain above which a bond breaks: {remedy}"

@@ -127,7 +127,7 @@ class Track(Diagnostic):
 
 
 class BrokenBonds(Diagnostic):
-    """Number of broken bonds."""
+    """Number of broken bonds, including those with an end in the frame or outside the outline."""
 
     type: Literal["broken"] = "broken"
 

@@ -26,6 +26,9 @@ if TYPE_CHECKING:
 
 
 Rows = NDArray[np.intp]
+PLACES = ("body", "outside the outline", "frame")
+"""Places of bonds. A bond belongs to the frame if one of its ends is a frame point, and is outside
+the outline if one of its ends is a particle of a cut cell outside the outline."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +40,7 @@ class BondStatus:
     step of breaking, `order` the position among the broken bonds, counted from 1, and
     `strain_at_break` the strain; they are None if they are unknown. `breaks_above` is the strain
     above which the bond breaks, and None if the fracture model does not define it. `strain` is the
-    strain at the recorded step `at_step`.
+    strain at the recorded step `at_step`. `place` is one of PLACES.
     """
 
     bond: tuple[int, int]
@@ -50,6 +53,7 @@ class BondStatus:
     breaks_above: float | None
     strain: float
     at_step: float
+    place: str
 
     @property
     def share(self) -> float | None:
@@ -129,6 +133,15 @@ class BondRecords:
         touches = frame[self.bonds.ends - 1].any(axis=1)
         return np.asarray(touches & (not self.model.breaks_frame_bonds()))
 
+    @cached_property
+    def places(self) -> Rows:
+        """(bond,): place of the bond, as an index of PLACES."""
+        outside = np.zeros(self._dataset.sizes["particle"], np.bool_)
+        if "inside" in self._dataset.variables:
+            outside = self._dataset["inside"].values == 0
+        of_particles = np.where(self._dataset["role"].values == OF_FRAME, 2, outside)
+        return np.asarray(of_particles[self.bonds.ends - 1].max(axis=1), np.intp)
+
     def strains(self, rows: Rows, time: int | slice = -1) -> Floats:
         """Return the strains of some bonds, (..., bond), at recorded times. `time` is an index
         along the dimension of this name."""
@@ -165,6 +178,7 @@ class BondRecords:
                 breaks_above=None if self.spared[row] else _known(self.limits[row]),
                 strain=strain,
                 at_step=as_step(times[time]),
+                place=PLACES[self.places[row]],
             )
             for row, strain in zip(rows.tolist(), strains, strict=True)
         ]

@@ -9,6 +9,7 @@ from remembering_parts import Weakest
 
 import pbdkit
 from pbdkit.io.explain import BondRecords
+from pbdkit.io.layout import OF_FRAME
 from pbdkit.scene.scene import build_scene
 
 RATE = 0.03125
@@ -119,6 +120,7 @@ def test_json_contains_the_same_facts(explain):
     assert found["bond"] == {
         "bond": [1, 3], "shell": 1, "rest_length": 1.0, "state": "broken", "step": 17, "order": 1,
         "strain_at_break": 17 * RATE, "breaks_above": 0.5, "strain": 1.25, "at_step": 40,
+        "place": "body",
     }  # fmt: skip
     assert found["most_strained"] == {"step": 40, "strain": 1.25}
     assert [(o["bond"], o["state"]) for o in found["around"]] == [
@@ -181,6 +183,41 @@ def test_only_broken_bonds_exceeded_their_limit(parts):
     assert (True in spared) == (not parts["fracture"].get("frame_bonds", True))
     cut = [s for s in standings if s.state == "broken from the start"]
     assert bool(cut) == ("cracks" in parts["fracture"])
+
+
+DISC = {
+    "body": {"type": "disc", "radius": 3.3, "centre": [0.0, 0.0]},
+    "neighbours": {"type": "chebyshev"},
+    "rule": {"type": "elastic", "poisson_ratio": 0.3},
+    "frame": {"type": "natural"},
+    "solver": {"type": "stepping", "relaxation": "auto"},
+    "fracture": {"type": "strain", "failure": 0.2},
+    "leaders": [{"select": {"edge": edge}, "motion": motion} for edge, motion in (
+        ("left", {"type": "hold"}),
+        ("right", {"type": "velocity", "velocity": [0.2, 0.0], "steps": 40}),
+    )],
+}  # fmt: skip
+
+
+def test_bonds_outside_the_body_are_counted_separately(explain):
+    answer = explain(**DISC).out.splitlines()
+    with pbdkit.open("bar.nc") as ds:
+        outside = (ds.inside.values == 0)[ds.bond_ends.values - 1].any(axis=1)
+        broken = ds.broken_step.values > 0
+    counts = int((broken & ~outside).sum()), int((broken & outside).sum())
+    assert min(counts) > 0
+    assert answer[1] == (
+        f"of these {counts[0]} in the body, {counts[1]} with an end outside its outline, and 0 with "
+        "an end in the frame"
+    )
+    assert any(line.endswith("  outside the outline") for line in answer)
+
+
+def test_bonds_of_frame_points_belong_to_the_frame():
+    ds, found = explained(BAR | SHEET)
+    of_frame = (ds.role.values == OF_FRAME)[ds.bond_ends.values - 1].any(axis=1)
+    np.testing.assert_array_equal(found.places, np.where(of_frame, 2, 0))
+    assert 0 < of_frame.sum() < len(of_frame)
 
 
 def test_the_limit_of_a_threshold_is_its_length():
