@@ -185,8 +185,8 @@ def test_only_broken_bonds_exceeded_their_limit(parts):
     assert bool(cut) == ("cracks" in parts["fracture"])
 
 
-DISC = {
-    "body": {"type": "disc", "radius": 3.3, "centre": [0.0, 0.0]},
+CUT = {
+    "body": {"type": "rectangle", "width": 6.0, "height": 3.5},
     "neighbours": {"type": "chebyshev"},
     "rule": {"type": "elastic", "poisson_ratio": 0.3},
     "frame": {"type": "natural"},
@@ -200,7 +200,7 @@ DISC = {
 
 
 def test_bonds_outside_the_body_are_counted_separately(explain):
-    answer = explain(**DISC).out.splitlines()
+    answer = explain(**CUT).out.splitlines()
     with pbdkit.open("bar.nc") as ds:
         outside = (ds.inside.values == 0)[ds.bond_ends.values - 1].any(axis=1)
         broken = ds.broken_step.values > 0
