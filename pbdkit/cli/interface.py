@@ -238,7 +238,7 @@ HISTORY = "history"
 @click.command()
 @result_argument("file")
 @click.argument("kind", required=False, type=click.Choice([*CURVES, HISTORY, *CRACKS]))
-@click.option("-o", "--output", type=PATH, help="PNG, SVG or PDF.")
+@click.option("-o", "--output", type=PATH, help="PNG, SVG, PDF or CSV.")
 @click.option("--y", metavar="VARIABLE", help="Variable to draw, e.g. reaction_x or pe1.")
 @click.option("--x", metavar="VARIABLE", help="Variable of the abscissa; default the time.")
 @click.option(
@@ -259,7 +259,7 @@ HISTORY = "history"
 @click.option("--load", type=int, help="Forces of this load.")
 @click.option("--obstacle", type=int, help="Forces of this obstacle.")
 @at_option
-@click.option("--force", is_flag=True, help="Replace an existing picture.")
+@click.option("--force", is_flag=True, help="Replace an existing file.")
 def curve(**options: Any) -> None:
     """Draw quantities of a result over time: a curve, histories, the crack.
 
@@ -274,7 +274,7 @@ def curve(**options: Any) -> None:
 
     KIND is by default the first that the result has. --y alone draws that variable over the steps,
     and with --particle or --bond its history there. Results of sweeps have a line for each member;
-    for cracks, and load-displacement of groups and obstacles, select one member with --at.
+    for cracks, select one member with --at. With -o NAME.csv the points of the lines are written.
     """
     call("plot:curve", **options)
 

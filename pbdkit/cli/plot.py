@@ -12,7 +12,8 @@ from pbdkit import plotting
 from pbdkit.cli.interface import CRACKS, HISTORY
 from pbdkit.cli.options import load_experiment
 from pbdkit.cli.output import refuse_output, refuse_unwritable, save
-from pbdkit.errors import ExperimentError
+from pbdkit.errors import ExperimentError, refuse_no_matplotlib
+from pbdkit.io.atomic_file import write
 from pbdkit.io.open import reading
 from pbdkit.io.other_files import is_experiment, refuse_other_file
 from pbdkit.plotting.movie import refuse_no_movie
@@ -21,7 +22,11 @@ from pbdkit.progress import progress_bar
 
 if TYPE_CHECKING:
     import xarray
-    from matplotlib.axes import Axes
+
+    from pbdkit.plotting.curves import Chart
+
+TABLE = ".csv"
+"""File name extension of tables of curves."""
 
 
 def plot(
@@ -101,13 +106,22 @@ def curve(
     force: bool,
     **options: Any,
 ) -> None:
-    """Draw quantities of a result over time."""
+    """Draw quantities of a result over time, or write them as CSV."""
     refuse_other_file(file)
     path = output or file.with_name(f"{file.stem}-{_default_name(kind, options)}.png")
+    is_table = path.suffix == TABLE
     refuse_output(path, force=force)
-    refuse_unwritable(path)
+    refuse_no_matplotlib()
+    refuse_unwritable(None if is_table else path, path)
     with reading(file, sweeps=True, at=at) as dataset:
-        save(path, figure_of(_draw(dataset, kind, **options)), replace=force)
+        if is_table:
+            write(path, _chart(dataset, kind, **options).csv().encode(), replace=force)
+            click.echo(f"{path} written")
+        elif kind in CRACKS:
+            save(path, figure_of(plotting.crack(dataset, kind=CRACKS[kind])), replace=force)
+        else:
+            axes = _chart(dataset, kind, **options).draw(None)
+            save(path, figure_of(axes), replace=force)
 
 
 def _default_name(kind: str | None, options: dict[str, Any]) -> str:
@@ -117,7 +131,7 @@ def _default_name(kind: str | None, options: dict[str, Any]) -> str:
     return kind or options["y"] or "curve"
 
 
-def _draw(
+def _chart(
     dataset: xarray.Dataset,
     kind: Any,
     x: str | None,
@@ -125,11 +139,21 @@ def _draw(
     particles: tuple[int, ...],
     bond: tuple[int, int] | None,
     **forces: Any,
-) -> Axes:
+) -> Chart:
+    """Return the lines of a curve. Raises ExperimentError for the map of a crack, which has
+    none."""
+    from pbdkit.plotting.cracks import crack_chart
+    from pbdkit.plotting.curves import curve_chart, history_chart
+
     if x is not None and y is None:
         raise ExperimentError(f"--x {x}: requires a variable to draw; add --y VARIABLE")
     if kind in CRACKS:
-        return plotting.crack(dataset, kind=CRACKS[kind])
+        if CRACKS[kind] == "map":
+            raise ExperimentError(
+                f"{kind} is a map and cannot be written as CSV; `pbdkit explain --json` lists the "
+                "broken bonds"
+            )
+        return crack_chart(dataset, CRACKS[kind])
     if kind == HISTORY or (kind is None and (particles or bond)):
-        return plotting.history(dataset, y, particle=particles or None, bond=bond)
-    return plotting.curve(dataset, x, y, kind=kind, **forces)
+        return history_chart(dataset, y, particles or None, (None, None), bond)
+    return curve_chart(dataset, x, y, kind, forces)

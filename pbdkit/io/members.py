@@ -78,7 +78,7 @@ def member(dataset: xarray.Dataset, choice: Mapping[str, Any]) -> xarray.Dataset
     words = ", ".join(f"{name}={value}" for name, value in choice.items())
     title = f"{dataset.attrs.get('title', 'sweep')}, {words}"
     selection = selection.assign_attrs(title=title) if choice else selection
-    return selection if selection[STATUS].ndim else _with_experiment(selection)
+    return selection if selection[STATUS].ndim else with_experiment(selection)
 
 
 def choices(dataset: xarray.Dataset) -> str:
@@ -130,7 +130,7 @@ def _is_alike(label: Any, value: Any) -> bool:
     return False
 
 
-def _with_experiment(selection: xarray.Dataset) -> xarray.Dataset:
+def with_experiment(selection: xarray.Dataset) -> xarray.Dataset:
     """Return a member with its experiment. Times that only other members reached are removed."""
     from pbdkit.model.experiment import Experiment  # This import loads pydantic.
 

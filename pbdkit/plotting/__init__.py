@@ -341,10 +341,10 @@ def curve(
     >>> ax = ds.pbd.curve("pe1")
     """
     refuse_no_matplotlib()
-    from pbdkit.plotting.curves import draw_curve
+    from pbdkit.plotting.curves import curve_chart
 
     chosen = {"group": group, "load": load, "obstacle": obstacle}
-    return draw_curve(dataset, x, y, kind, chosen, ax)
+    return curve_chart(dataset, x, y, kind, chosen).draw(ax)
 
 
 def history(
@@ -395,6 +395,6 @@ def history(
     >>> ax = ds.pbd.history("u_x", particle=[67, 68])
     """
     refuse_no_matplotlib()
-    from pbdkit.plotting.curves import draw_history
+    from pbdkit.plotting.curves import history_chart
 
-    return draw_history(dataset, name, particle, (i, j), bond, ax)
+    return history_chart(dataset, name, particle, (i, j), bond).draw(ax)

@@ -19,7 +19,7 @@ from scipy.spatial import KDTree
 from pbdkit.array_types import Array
 from pbdkit.errors import ExperimentError
 from pbdkit.io.layout import OF_BODY, rows_of
-from pbdkit.plotting.curves import BROAD, TALL, Line, draw_lines, member_dims, new_axes
+from pbdkit.plotting.curves import BROAD, STEPS, TALL, Chart, Line, Quantity, member_dims, new_axes
 from pbdkit.plotting.style import in_its_units, label
 
 if TYPE_CHECKING:
@@ -73,10 +73,17 @@ def draw_crack(dataset: xarray.Dataset, kind: Kind, ax: Axes | None) -> Axes:
         raise ExperimentError(
             f"'{kind}' is not a picture of a crack; use one of {', '.join(KINDS)}"
         )
-    broken, values = _broken(dataset), np.empty(0)
-    title = str(dataset.attrs.get("title", ""))
     if kind == "map":
-        return _map(dataset, broken, title, ax)
+        return _map(dataset, _broken(dataset), str(dataset.attrs.get("title", "")), ax)
+    ax = crack_chart(dataset, kind).draw(ax)
+    for line in ax.lines:
+        line.set_marker("")
+    return ax
+
+
+def crack_chart(dataset: xarray.Dataset, kind: Kind) -> Chart:
+    """Return the chart of the number of broken bonds, or of the length of the longest crack."""
+    broken, values = _broken(dataset), np.empty(0)
     steps, counts = np.unique(broken.step, return_counts=True)
     if kind == "bonds":
         values, meaning, units = np.cumsum(counts), "number of broken bonds", ""
@@ -87,13 +94,8 @@ def draw_crack(dataset: xarray.Dataset, kind: Kind, ax: Axes | None) -> Axes:
     last = math.ceil(dataset["time"].values[-1])
     x = np.concatenate([[0], np.repeat(steps, 2), [last]])
     y = np.repeat([0.0, *values], 2)
-    ax = ax or new_axes()
-    ax.set_xlabel(label("time", "step", width=BROAD))
-    ax.set_ylabel(label(meaning, units, width=TALL))
-    draw_lines(ax, [Line(x, y)], title, "")
-    for line in ax.lines:
-        line.set_marker("")
-    return ax
+    title = str(dataset.attrs.get("title", ""))
+    return Chart([Line(x, y)], STEPS, Quantity(meaning, units), title)
 
 
 @dataclass(frozen=True)

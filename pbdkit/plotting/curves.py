@@ -8,9 +8,11 @@ member.
 
 from __future__ import annotations
 
+import csv
+import io
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import Any, Literal
 
@@ -26,7 +28,7 @@ from numpy.typing import NDArray
 from pbdkit.array_types import Array, Floats
 from pbdkit.errors import ExperimentError
 from pbdkit.io.layout import INDICES, rows_at, scene_of
-from pbdkit.io.members import TEXT, type_alone
+from pbdkit.io.members import STATUS, SWEEP, TEXT, type_alone, with_experiment
 from pbdkit.plotting.data import CHOSEN_BY, OF_A_RUN, SUM_BLOCK_BYTES, in_units, scalar, variable
 from pbdkit.plotting.figure_layout import new_figure
 from pbdkit.plotting.style import in_its_units, label, plain
@@ -103,11 +105,13 @@ def _displacements(dataset: xarray.Dataset, dim: str) -> Any:
     obstacles that exert the force. The result has units as an attribute."""
     if dim == "load":
         return in_units(dataset["load_displacement"])
-    if extra_dims := [str(d) for d in dataset[FORCE_OF[dim]].dims if d not in OF_A_RUN]:
+    extra_dims = [str(d) for d in dataset[FORCE_OF[dim]].dims if d not in OF_A_RUN]
+    if extra_dims and SWEEP in dataset.attrs and "position" in dataset.variables:
+        return _of_members(dataset, dim)
+    if extra_dims and SWEEP not in dataset.attrs:
         raise ExperimentError(
-            f"a sweep has no single force-displacement curve (along {', '.join(extra_dims)}); "
-            "select one with --at NAME=VALUE, in Python with ds.pbd.member(NAME=VALUE), or give x "
-            "and y"
+            f"the dataset contains several runs, along {', '.join(extra_dims)}; select one with "
+            "isel, or give x and y"
         )
     if "position" not in dataset.variables:
         raise ExperimentError(
@@ -126,6 +130,29 @@ def _displacements(dataset: xarray.Dataset, dim: str) -> Any:
     along = {"time": dataset["time"], dim: dataset[dim], "axis": dataset["axis"]}
     return xarray.DataArray(
         displacement * factor, along, ("time", dim, "axis"), attrs={"units": units}
+    )
+
+
+def _of_members(dataset: xarray.Dataset, dim: str) -> Any:
+    """Return the displacements of all members of a sweep. Members without a result have NaN."""
+    dims = [str(name) for name in dataset[STATUS].dims]
+    labels = {"time": dataset["time"], dim: dataset[dim]}
+    missing = xarray.DataArray(
+        np.nan, labels | {"axis": dataset["axis"]}, ("time", dim, "axis"), attrs={"units": ""}
+    )
+    parts = []
+    for place in product(*(range(dataset.sizes[name]) for name in dims)):
+        selection = dataset.isel(dict(zip(dims, place, strict=True)))
+        has_result = bool(selection["position"].notnull().any())
+        part = _displacements(with_experiment(selection), dim) if has_result else missing
+        parts.append(part.reindex(labels))
+    shape = tuple(dataset.sizes[name] for name in dims)
+    units = next((part.attrs["units"] for part in parts if part.attrs["units"]), "")
+    stacked = np.stack([part.values for part in parts]).reshape(*shape, *parts[0].shape)
+    return (
+        missing.expand_dims({name: dataset[name] for name in dims})
+        .copy(data=stacked)
+        .assign_attrs(units=units)
     )
 
 
@@ -186,7 +213,8 @@ ROUND = [1, 2, 5, 10]
 class Line:
     """Values `y` over `x`. `hue` is the index of the particle or of the member of a sweep; lines
     with the same `hue` have the same colour. If `value` is a number, it determines the position of
-    the colour in a colour map. The line of a second component is `dashed`."""
+    the colour in a colour map. The line of a second component is `dashed`. `member` contains the
+    values of the parameters of a sweep, and `of` the name without them."""
 
     x: Array
     y: Array
@@ -194,6 +222,63 @@ class Line:
     hue: int = 0
     value: float | None = None
     dashed: bool = False
+    member: Mapping[str, Any] = field(default_factory=dict)
+    of: str = ""
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """Meaning and units of the values along an axis."""
+
+    meaning: str
+    units: str
+
+    @classmethod
+    def of(cls, values: Any) -> Quantity:
+        """Return the quantity of a DataArray from `in_units`."""
+        return cls(values.attrs["long_name"], values.attrs["units"])
+
+    @property
+    def heading(self) -> str:
+        """Heading of a column of a table."""
+        return f"{self.meaning} ({self.units})" if self.units not in ("", "1") else self.meaning
+
+
+STEPS = Quantity("time", "step")
+"""Time as the abscissa of histories."""
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Lines of one quantity over another, with a title. Colours have the label `hues`."""
+
+    lines: Sequence[Line]
+    x: Quantity
+    y: Quantity
+    title: str
+    hues: str = ""
+
+    def draw(self, ax: Axes | None) -> Axes:
+        """Draw the lines on axes, by default those of a new figure."""
+        ax = ax or new_axes()
+        ax.set_xlabel(label(self.x.meaning, self.x.units, width=BROAD))
+        ax.set_ylabel(label(self.y.meaning, self.y.units, width=TALL))
+        draw_lines(ax, self.lines, self.title, self.hues)
+        return ax
+
+    def csv(self) -> str:
+        """Return the points as CSV. Each row contains the parameters of the member of a sweep, the
+        name of the line if there are several, and the coordinates of a point."""
+        parameters = [*dict.fromkeys(name for line in self.lines for name in line.member)]
+        named = ["line"] if any(line.of for line in self.lines) else []
+        text = io.StringIO()
+        rows = csv.writer(text, lineterminator="\n")
+        rows.writerow([*parameters, *named, self.x.heading, self.y.heading])
+        for line in self.lines:
+            first = [*(line.member.get(name, "") for name in parameters), *(line.of for _ in named)]
+            for point in zip(line.x.tolist(), line.y.tolist(), strict=True):
+                rows.writerow([*first, *(repr(number).removesuffix(".0") for number in point)])
+        return text.getvalue()
 
 
 def new_axes(width: float = SIZE_IN[0], height: float = SIZE_IN[1]) -> Axes:
@@ -289,19 +374,31 @@ def lines_of(dataset: xarray.Dataset, x: Any, y: Any) -> list[Line]:
         at, over = across.values[place], drawn.values[place]
         finite = np.isfinite(at) & np.isfinite(over)
         along = dict(zip(dims, place, strict=True))
-        name = ", ".join(f"{dim} {_label_of(dataset, dim, n)}" for dim, n in along.items())
+        member = {dim: _value_of(dataset, dim, n) for dim, n in along.items()}
+        name = ", ".join(
+            f"{dim} {value:.4g}" if isinstance(value, float) else f"{dim} {value}"
+            for dim, value in member.items()
+        )
         value = _number(dataset, dims[0], place[0]) if len(dims) == 1 else None
         if finite.any():
-            lines.append(Line(at[finite], over[finite], name, hue, value))
+            headings = {_heading(dataset, dim): each for dim, each in member.items()}
+            line = Line(at[finite], over[finite], name, hue, value, member=headings)
+            lines.append(line)
     return lines
 
 
-def _label_of(dataset: xarray.Dataset, dim: str, place: int) -> str:
+def _value_of(dataset: xarray.Dataset, dim: str, place: int) -> float | str:
+    """Return the value of a parameter, or the index of a member without one."""
     for name in (f"{dim}{TEXT}", dim):
         if name in dataset.coords and dataset[name].dims == (dim,):
             value = dataset[name].values[place]
-            return f"{value:.4g}" if isinstance(value, np.floating) else type_alone(str(value))
+            return float(value) if isinstance(value, np.floating) else type_alone(str(value))
     return str(place)
+
+
+def _heading(dataset: xarray.Dataset, dim: str) -> str:
+    """Return the heading of the column of a parameter."""
+    return Quantity(dim, str(dataset[dim].attrs.get("units", ""))).heading
 
 
 def _number(dataset: xarray.Dataset, dim: str, place: int) -> float | None:
@@ -330,15 +427,14 @@ NEEDED_DIAGNOSTICS = {
 """Messages for results that do not contain the variables of a curve, by kind of curve."""
 
 
-def draw_curve(
+def curve_chart(
     dataset: xarray.Dataset,
     x: str | None,
     y: str | None,
     kind: Kind | None,
     chosen: dict[str, int | None],
-    ax: Axes | None,
-) -> Axes:
-    """Draw a curve in the same way as `pbdkit.plotting.curve`. `chosen` is the group, load or
+) -> Chart:
+    """Return the chart that `pbdkit.plotting.curve` draws. `chosen` is the group, load or
     obstacle."""
     if y is None:
         x, y = None, x
@@ -347,8 +443,8 @@ def draw_curve(
     if y is not None:
         drawn = [scalar(dataset, y, chosen)]
         across = scalar(dataset, x or _own_axis(drawn[0]), chosen)
-        return _draw(dataset, across, drawn, ax)
-    return _of_kind(dataset, kind or _first_kind(dataset), chosen, ax)
+        return _chart(dataset, across, drawn)
+    return _of_kind(dataset, kind or _first_kind(dataset), chosen)
 
 
 def _own_axis(values: Any) -> str:
@@ -369,12 +465,10 @@ def _first_kind(dataset: xarray.Dataset) -> Kind:
     )
 
 
-def _of_kind(
-    dataset: xarray.Dataset, kind: Kind, chosen: dict[str, int | None], ax: Axes | None
-) -> Axes:
+def _of_kind(dataset: xarray.Dataset, kind: Kind, chosen: dict[str, int | None]) -> Chart:
     if kind == "load-displacement":
         pair = load_curve(dataset, chosen)
-        return _draw(dataset, pair.displacement, [pair.force], ax)
+        return _chart(dataset, pair.displacement, [pair.force])
     if kind not in NEEDED_DIAGNOSTICS:
         raise ExperimentError(f"there is no curve '{kind}'; use one of {', '.join(KINDS)}")
     names = ["nominal_stress"] if kind == "stress-strain" else _energies(dataset)
@@ -382,7 +476,7 @@ def _of_kind(
         raise ExperimentError(NEEDED_DIAGNOSTICS[kind])
     across = "nominal_strain" if kind == "stress-strain" else "time"
     drawn = [scalar(dataset, name, chosen) for name in names]
-    return _draw(dataset, scalar(dataset, across, chosen), drawn, ax)
+    return _chart(dataset, scalar(dataset, across, chosen), drawn)
 
 
 def _energies(dataset: xarray.Dataset) -> list[str]:
@@ -393,23 +487,21 @@ def _energies(dataset: xarray.Dataset) -> list[str]:
     return [name for name, unit in zip(names, units, strict=True) if unit == units[0]]
 
 
-def _draw(dataset: xarray.Dataset, x: Any, drawn: list[Any], ax: Axes | None) -> Axes:
+def _chart(dataset: xarray.Dataset, x: Any, drawn: list[Any]) -> Chart:
     has_several = len(drawn) > 1
     lines = []
     for n, y in enumerate(drawn):
         for line in lines_of(dataset, x, y):
-            parts = [line.name, y.attrs["long_name"]] if has_several else [line.name]
+            of = y.attrs["long_name"] if has_several else ""
             hue = line.hue if member_dims(y) else n
-            name = ", ".join(filter(None, parts))
-            lines.append(replace(line, name=name, hue=hue, dashed=n > 0))
+            name = ", ".join(filter(None, (line.name, of)))
+            lines.append(replace(line, name=name, hue=hue, dashed=n > 0, of=of))
     if not lines:
         raise ExperimentError(f"'{drawn[0].name}' has no finite value")
-    ax = ax or new_axes()
-    ax.set_xlabel(label(x.attrs["long_name"], x.attrs["units"], width=BROAD))
-    common = "pseudo-energy" if has_several else drawn[0].attrs["long_name"]
-    ax.set_ylabel(label(common, drawn[0].attrs["units"], width=TALL))
-    draw_lines(ax, lines, str(dataset.attrs.get("title", "")), hues_of(drawn[0]))
-    return ax
+    quantity = Quantity.of(drawn[0])
+    common = replace(quantity, meaning="pseudo-energy") if has_several else quantity
+    title = str(dataset.attrs.get("title", ""))
+    return Chart(lines, Quantity.of(x), common, title, hues_of(drawn[0]))
 
 
 MAX_LINES = 200
@@ -417,16 +509,15 @@ MAX_LINES = 200
 Numbers = int | Iterable[int]
 
 
-def draw_history(
+def history_chart(
     dataset: xarray.Dataset,
     name: str | None,
     particle: Numbers | None,
     site: tuple[int | None, int | None],
     bond: Sequence[int] | None,
-    ax: Axes | None,
-) -> Axes:
-    """Draw a variable of particles or of a bond over time, in the same way as
-    `pbdkit.plotting.history`."""
+) -> Chart:
+    """Return the chart of a variable of particles or of a bond over time, which
+    `pbdkit.plotting.history` draws."""
     if not isinstance(name, str | None):
         raise ExperimentError(
             f"history: expected the name of a variable first, such as 'u', got {name!r}; a "
@@ -446,11 +537,7 @@ def draw_history(
     hues = "bond" if bond is not None else "number of the particle"
     if len(drawn) == 1 and (members := hues_of(values)):
         title, hues = f"{title}, {hues} {drawn[0].name}".replace("number of the ", ""), members
-    ax = ax or new_axes()
-    ax.set_xlabel(label("time", "step", width=BROAD))
-    ax.set_ylabel(label(values.attrs["long_name"], values.attrs["units"], width=TALL))
-    draw_lines(ax, lines, title, hues)
-    return ax
+    return Chart(lines, STEPS, Quantity.of(values), title, hues)
 
 
 @dataclass(frozen=True)
@@ -477,8 +564,8 @@ def _lines(dataset: xarray.Dataset, series: Series, n: int, alone: bool) -> Iter
             by_member = alone and line.name
             words = [line.name, axis] if by_member else [series.name, axis, line.name]
             hue, value = (line.hue, line.value) if by_member else (n, series.number)
-            name = ", ".join(filter(None, words))
-            yield replace(line, name=name, hue=hue, value=value, dashed=k > 0)
+            name, of = (", ".join(filter(None, each)) for each in (words, (series.name, axis)))
+            yield replace(line, name=name, hue=hue, value=value, dashed=k > 0, of=of)
 
 
 def _numbers(

@@ -207,8 +207,8 @@ def test_bonds_outside_the_body_are_counted_separately(explain):
     counts = int((broken & ~outside).sum()), int((broken & outside).sum())
     assert min(counts) > 0
     assert answer[1] == (
-        f"of these {counts[0]} in the body, {counts[1]} with an end outside its outline, and 0 with "
-        "an end in the frame"
+        f"of these {counts[0]} in the body, {counts[1]} with an end outside its outline, and 0 "
+        "with an end in the frame"
     )
     assert any(line.endswith("  outside the outline") for line in answer)
 

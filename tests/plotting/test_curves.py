@@ -1,7 +1,9 @@
 """Histories, curves and cracks show the numbers of the dataset, under labels that can be read."""
 
+import csv
 import json
 from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,6 +22,7 @@ FORCES = [
     {"type": "track", "numbers": [9, 10]},
     {"type": "stress-strain", "youngs_modulus": 2.0, "width": 4.0, "group": 1, "against": 0},
 ]
+MM = {"units": {"length": "2 mm", "youngs_modulus": "70 GPa", "thickness": "1 mm"}}
 CALIBRATED = {
     "neighbours": {"type": "chebyshev", "shells": 1},
     "rule": {"type": "elastic", "poisson_ratio": 0.3},
@@ -373,12 +376,44 @@ def test_loads_of_a_sweep_have_one_line_per_member():
     np.testing.assert_array_equal(drawn(ax)[0][1], -found.load_resultant.sel(across))
 
 
-def test_leader_curve_of_a_sweep_requires_one_member():
-    led = experiment(**CALIBRATED, leaders=[HELD, pull_right(0.01, 0.0)], steps=2,
-                     diagnostics=[{"type": "reaction", "youngs_modulus": 2.0}])  # fmt: skip
-    found = pbdkit.sweep(led, vary={"solver.relaxation": [0.5, 1.0]}, workers=1, progress=False)
-    with pytest.raises(pbdkit.ExperimentError, match=r"relaxation.; select one with --at"):
-        found.pbd.curve()
+def test_leader_curves_of_a_sweep_are_those_of_its_members(call, tmp_path):
+    led = experiment(**CALIBRATED, **MM, leaders=[HELD, pull_right(0.01, 0.0)], steps=2,
+                     diagnostics=[{"type": "reaction"}])  # fmt: skip
+    values = [0.5, 1.0]
+    found = pbdkit.sweep(led, vary={"solver.relaxation": values}, workers=1, progress=False)
+    ax = found.pbd.curve()
+    assert legend_texts(ax) == ["relaxation 0.5", "relaxation 1"]
+    alone = [drawn(found.pbd.member(relaxation=value).pbd.curve())[0] for value in values]
+    np.testing.assert_array_equal(drawn(ax), alone)
+    assert np.ptp(alone, axis=0).max() > 0.0
+    found.to_netcdf(tmp_path / "s.nc")
+    assert call("curve", str(tmp_path / "s.nc"), "-o", "s.csv").out == "s.csv written\n"
+    heading, *rows = csv.reader(Path("s.csv").read_text().splitlines())
+    assert heading == ["relaxation", "displacement of leader group 1 along x (mm)",
+                       "force of leader group 1 along x (N)"]  # fmt: skip
+    points = [
+        [value, *point] for value, line in zip(values, alone, strict=True) for point in line.T
+    ]
+    np.testing.assert_array_equal(np.array(rows, float), points)
+
+
+def test_histories_are_tables_with_a_row_for_each_point(torn):
+    chart = curves.history_chart(torn, "u", [8, 9], (None, None), None)
+    heading, *rows = csv.reader(chart.csv().splitlines())
+    assert heading == ["line", "time (step)", "displacement (lattice unit)"]
+    names = [line.name for line in chart.lines]
+    assert [*dict.fromkeys(row[0] for row in rows)] == names
+    assert len(names) == 4
+    u = [float(row[2]) for row in rows if row[0] == names[1]]
+    np.testing.assert_array_equal(u, torn.position[:, 7, 1] - torn.reference[7, 1])
+
+
+def test_map_of_a_crack_is_not_a_table(call, torn):
+    torn.pbd.save("torn.nc")
+    assert "cannot be written as CSV" in call("curve", "torn.nc", "crack", "-o", "crack.csv").err
+    assert call("curve", "torn.nc", "broken-bonds", "-o", "b.csv").code == 0
+    last = Path("b.csv").read_text().splitlines()[-1]
+    assert last == f"20,{(torn.broken_step >= 0).sum().item()}"
 
 
 def test_variables_that_a_sweep_did_not_keep_are_no_damage(call, tmp_path):
@@ -398,7 +433,7 @@ def test_variables_that_a_sweep_did_not_keep_are_no_damage(call, tmp_path):
     assert (strain.code, "damaged" in strain.err) == (2, False)
     assert "requires `number`, which the sweep did not keep; add `position` to kee" in strain.err
     whole = call("curve", file, "load-displacement")
-    assert (whole.code, "select one with --at NAME=VALUE" in whole.err) == (2, True)
+    assert (whole.code, "load-displacement requires `position`" in whole.err) == (2, True)
     force = call("curve", file, "--y", "reaction_x", *at)
     assert (force.code, "select one by --group 1, in Python by group=1" in force.err) == (2, True)
 
