@@ -584,8 +584,10 @@ class Simulation:
     def record(self, path: str | Path | None = None, *, force: bool = False) -> Recording:
         """Begin to record at the current state, as the field `record` of the experiment specifies.
 
-        The current and the last state are always recorded. Recording ends with the ``with`` block,
-        by `Recording.close`, or with the simulation.
+        The current and the last state are always recorded. A state is recorded when the next step
+        begins or recording ends; an equilibrium that `equilibrate` has computed until then is
+        recorded in its place. Recording ends with the ``with`` block, by `Recording.close`, or with
+        the simulation.
 
         Parameters
         ----------

@@ -334,6 +334,23 @@ def test_intermediate_equilibrium_is_recorded_and_continued(tensile: dict[str, A
     np.testing.assert_allclose(ds.position[-1], rest.position, rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("steps", [0, 1, 3])
+def test_recording_begins_with_the_equilibrium_at_its_first_step(
+    tensile: dict[str, Any], steps: int
+) -> None:
+    simulation = pbdkit.Simulation(tensile | {"steps": 12, "record": {"every": 5}})
+    simulation.step(7)
+    before = simulation.state
+    with simulation.record() as recording:
+        simulation.equilibrate()
+        rest = simulation.state
+        simulation.step(steps)
+    ds = recording.dataset
+    assert ds.time.values.tolist() == sorted({7, 7 + steps})
+    assert not np.array_equal(rest.position, before.position)
+    np.testing.assert_array_equal(ds.position.sel(time=7), rest.position)
+
+
 def test_equilibrium_of_the_solver_equals_that_of_a_run(tensile: dict[str, Any]) -> None:
     given = tensile | {"solver": {"type": "equilibrium"}}
     simulation = pbdkit.Simulation(given)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import shutil
 import sqlite3
+from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -71,12 +72,25 @@ def connect(path: Path, mode: str) -> sqlite3.Connection:
     if mode != "ro":
         settings.append("synchronous = FULL")
     try:
-        for setting in settings:
-            connection.execute(f"PRAGMA {setting}")
+        with _decoding_messages():
+            for setting in settings:
+                connection.execute(f"PRAGMA {setting}")
     except sqlite3.Error:
         connection.close()
         raise
     return connection
+
+
+@contextlib.contextmanager
+def _decoding_messages() -> Iterator[None]:
+    """Raise sqlite3.DatabaseError if a message of SQLite quotes bytes of a damaged schema that are
+    not valid UTF-8. Python raises UnicodeDecodeError in place of such a message."""
+    try:
+        yield
+    except UnicodeDecodeError as error:
+        damage = sqlite3.DatabaseError(f"the schema is damaged: {error}")
+        damage.sqlite_errorcode = sqlite3.SQLITE_CORRUPT
+        raise damage from error
 
 
 def open_read_only(path: Path, closing: contextlib.ExitStack) -> sqlite3.Connection:
@@ -88,10 +102,9 @@ def open_read_only(path: Path, closing: contextlib.ExitStack) -> sqlite3.Connect
     """
     connection = closing.enter_context(contextlib.closing(connect(path, "ro")))
     try:
-        connection.execute("BEGIN")
-        connection.execute("SELECT COUNT(*) FROM sqlite_master").fetchone()
-    except UnicodeDecodeError as error:  # A message of SQLite quotes damaged bytes.
-        raise sqlite3.DatabaseError(f"the schema is damaged: {error}") from error
+        with _decoding_messages():
+            connection.execute("BEGIN")
+            connection.execute("SELECT COUNT(*) FROM sqlite_master").fetchone()
     except sqlite3.OperationalError as error:
         if error.sqlite_errorcode != sqlite3.SQLITE_READONLY_ROLLBACK:
             raise

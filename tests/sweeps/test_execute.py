@@ -305,6 +305,16 @@ def test_intact_part_of_a_damaged_database_is_kept(small, tmp_path, run_only):
     assert run_only == []
 
 
+def test_schema_that_is_not_text_is_set_aside(small, tmp_path, run_only):
+    asked = {"vary": {"steps": [5, 6]}, "folder": tmp_path}
+    first, path = swept(small, **asked), tmp_path / stores.DATABASE
+    path.write_bytes(path.read_bytes().replace(b"CREATE TABLE", b"CREATE\xffTABLE"))
+    run_only.clear()
+    with pytest.warns(pbdkit.PbdkitWarning, match="the schema is damaged: .* 0 intact members"):
+        same(first, swept(small, **asked))
+    assert len(run_only) == 2
+
+
 def test_members_with_a_lost_log_are_reported(small, tmp_path, run_only):
     asked = {"vary": {"steps": [5, 6]}, "folder": tmp_path}
     with stores.Store(tmp_path):
