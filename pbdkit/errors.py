@@ -131,7 +131,8 @@ class StorageError(PbdkitError):
 
 
 class WriteError(StorageError):
-    """A file could not be written. An earlier file of this name is unchanged.
+    """A file could not be written. An earlier file of this name is unchanged, unless the message
+    states that the new one is complete.
 
     The message begins with the name of this file. If the error occurs while another file is read,
     the name of that file is not added to the message.

@@ -31,6 +31,9 @@ FULL = "the disk is full; free some space, or record fewer steps"
 """Message for a full disk."""
 FULL_BYTES = 2**20
 """Number of free bytes below which a disk counts as full."""
+UNSUPPORTED = {errno.EACCES, errno.EBADF, errno.EINVAL, errno.EISDIR, errno.ENOSYS, errno.ENOTSUP}
+UNSUPPORTED |= {errno.EOPNOTSUPP, errno.EPERM, errno.EROFS}
+"""Errors of systems and file systems on which a folder cannot be opened or synced."""
 MAX_ATTEMPTS = 10
 """Number of attempts to lock a file."""
 PAUSE_S = 0.02
@@ -103,13 +106,28 @@ def write_all(file: io.FileIO, data: bytes | bytearray | memoryview) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Sync the entries of a folder to the disk, if the file system supports this."""
-    with suppress(OSError):
+    """Sync the entries of a folder to the disk, if the file system supports this. Raises
+    OSError."""
+    try:
         descriptor = os.open(folder, os.O_RDONLY)
         try:
             os.fsync(descriptor)
         finally:
             os.close(descriptor)
+    except OSError as error:
+        if error.errno not in UNSUPPORTED:
+            raise
+
+
+def _sync_name(path: Path, folder: Path) -> None:
+    """Sync the name of a complete file or folder, in its folder. Raises WriteError."""
+    try:
+        sync_folder(folder)
+    except OSError as error:
+        raise WriteError(
+            f"{path}: is complete, but its name may be lost in a power cut, because the folder "
+            f"cannot be synced: {error.strerror}; check the disk, and copy the file to another one"
+        ) from None
 
 
 def make_folder(folder: Path) -> None:
@@ -309,7 +327,7 @@ def write_folder(folder: Path, texts: Mapping[str, str]) -> None:
             if os.path.lexists(folder):
                 raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST))
             temporary.rename(folder)
-            sync_folder(folder.absolute().parent)
+            _sync_name(folder, folder.absolute().parent)
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
 
@@ -383,6 +401,8 @@ class Destination:
         self._folder = path.parent.absolute()
         self.written = path
         """Path of the finished result. It differs from `path` if that name was in use."""
+        self.is_synced = False
+        """True once the name of the finished result is on the disk."""
 
     def temporary(self) -> io.FileIO:
         """Create and lock a file with a unique name in the folder of the result. Remove files with
@@ -396,9 +416,9 @@ class Destination:
             file.close()
 
     def take(self, temporary: Path, status: str) -> None:
-        """Give a temporary file the name of the result. Raises OSError. Also raises WriteError if a
-        file of that name has appeared in the meantime; the result then has another name in the same
-        folder."""
+        """Give a temporary file the name of the result. Raises OSError. Also raises WriteError if
+        the name cannot be synced, or if a file of that name has appeared in the meantime; the
+        result then has another name in the same folder."""
         whole = status in WHOLE
         if whole and self.replace:
             name = self._folder / self.path.name
@@ -410,7 +430,8 @@ class Destination:
         else:
             names = (p for p in self._free(whole) if _rename(temporary, self._folder / p.name))
             self.written = next(names)
-        sync_folder(self._folder)
+        _sync_name(self.written, self._folder)
+        self.is_synced = True
         if self.written != self.path and not self.replace:
             raise WriteError(
                 f"{self.path}: was created by another program meanwhile, and is not replaced; "

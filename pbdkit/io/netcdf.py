@@ -379,7 +379,7 @@ class NetcdfSink(KeepingSink):
         try:
             self._destination.take(self._temporary, status)
         finally:
-            if self.unfinished and not self._temporary.exists():
+            if self.unfinished and self._destination.is_synced:
                 self.unfinished.remove()
             file.disk.close()
 

@@ -22,7 +22,7 @@ import xxhash
 from numpy.typing import NDArray
 
 from pbdkit.array_types import Array
-from pbdkit.errors import ExperimentError, StorageError, reason_of
+from pbdkit.errors import ExperimentError, StorageError, StorageWarning, reason_of, warn_caller
 from pbdkit.io.atomic_file import FULL, is_full, lock, open_locked, sync_folder
 from pbdkit.io.checkpoint import Arrays, Checkpoint
 from pbdkit.io.paged_file import (
@@ -678,10 +678,17 @@ class UnfinishedRun:
 
     def remove(self) -> None:
         """Remove the store and release the lock, after the records have got the name of the
-        result."""
+        result. Warn if a file cannot be removed."""
         self._store.close()
         remove_store(self.output)
+        with suppress(OSError):  # The system may have kept the former name of the records, too.
+            if os.path.samestat(self.records.stat(), os.fstat(self.disk.fileno())):
+                self.records.unlink()
         self.disk.close()
+        for path in (store_of(self.output), self.records):
+            if path.exists():
+                text = f"{path}: cannot be removed; {self.output} is complete without it"
+                warn_caller(text, StorageWarning)
 
     def _dict(self, key: str) -> dict[str, Any]:
         facts = self._store.facts(key)

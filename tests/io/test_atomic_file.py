@@ -9,6 +9,7 @@ import os
 import resource
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -305,6 +306,51 @@ def test_new_folders_of_a_sweep_outlast_a_power_cut(
     assert result("sweep", "s.json", "-o", "of/s", "--workers", "1").code == 0
     here = Path.cwd()
     assert synced >= {here, here / "of", here / "of" / "s", here / "of" / "s" / "members"}
+
+
+def failing_sync(fault: int) -> Callable[[int], None]:
+    """Return a function in place of os.fsync that fails for the current folder."""
+    settle = os.fsync
+
+    def sync(descriptor: int) -> None:
+        if os.path.samestat(os.fstat(descriptor), Path.cwd().stat()):
+            raise OSError(fault, os.strerror(fault))
+        settle(descriptor)
+
+    return sync
+
+
+UNSYNCED = {name: WRITING[name] for name in ("run", "plot svg")} | {
+    "init": ["init", "out.yaml"],
+    "plugins new": ["plugins", "new", "pbdkit-mine"],
+}
+
+
+@pytest.mark.parametrize("name", UNSYNCED)
+def test_output_in_a_folder_that_cannot_be_synced_is_complete_and_named(
+    result: Call, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    output = Path(UNSYNCED[name][-1])
+    monkeypatch.setattr(os, "fsync", failing_sync(errno.EIO))
+    found = result(*UNSYNCED[name])
+    assert (found.code, output.exists(), list(Path().glob(".*"))) == (6, True, [])
+    assert found.err.startswith(f"pbdkit: {output}: is complete, but its name may be lost")
+    assert "Input/output error" in found.err
+    output.rename("first")
+    monkeypatch.setattr(os, "fsync", failing_sync(errno.EINVAL))  # for instance on a network
+    assert (result(*UNSYNCED[name]).code, output.exists()) == (0, True)
+
+
+def test_sweep_in_a_folder_that_cannot_be_synced_ends(
+    result: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ["sweep", "s.json", "-o", "s", "--workers", "1"]
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", failing_sync(errno.EIO))
+        found = result(*words)
+    assert found.code == 6
+    assert found.err.startswith("pbdkit: s: Input/output error; the disk failed")
+    assert result(*words).code == 0
 
 
 def test_picture_that_cannot_be_encoded_blames_no_file_that_is_read(

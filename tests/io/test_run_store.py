@@ -9,6 +9,7 @@ import json
 import os
 import random
 import signal
+import stat
 import sys
 import tempfile
 import time
@@ -104,11 +105,12 @@ def whole(call: Any) -> Any:
     return pbdkit.open("whole.nc")["position"].values
 
 
-def is_whole(right: Any) -> bool:
-    """Return whether the output is complete, and nothing else is in the folder."""
+def is_whole(right: Any, *left: str) -> bool:
+    """Return whether the output is complete, and nothing else is in the folder, apart from `left`,
+    which must be there."""
     with pbdkit.open(OUT) as dataset:
         same = np.array_equal(dataset["position"].values, right)
-    return same and names() <= {"e.json", "whole.nc", "out.nc"}
+    return same and names() == {"e.json", "whole.nc", "out.nc", *left}
 
 
 @pytest.mark.parametrize(
@@ -468,6 +470,51 @@ def test_store_on_a_network_uses_a_journal_without_shared_memory(
     assert names() >= {"out.nc.run", "out.nc.run-records"}
     assert not Path("out.nc.run-wal").exists()
     assert call("resume", str(OUT)).code == 0
+    assert is_whole(right)
+
+
+def test_store_is_kept_if_the_name_of_the_result_cannot_be_synced(
+    call: Any, often: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    right, settle, unsynced = whole(call), os.fsync, list[str]()
+    stopped(call, monkeypatch)
+
+    def sync(descriptor: int) -> None:
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            unsynced.append("folder")
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        settle(descriptor)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", sync)
+        found = call("resume", str(OUT))
+    assert (found.code, unsynced) == (6, ["folder"])
+    assert "out.nc: is complete, but its name may be lost in a power cut" in found.err
+    assert is_whole(right, "out.nc.run")
+    assert call("resume", str(OUT)).code == 2  # All steps are made.
+    assert is_whole(right)
+
+
+@pytest.mark.parametrize("name", ["out.nc.run", "out.nc.run-records"])
+def test_file_of_a_finished_run_that_cannot_be_removed_is_named(
+    call: Any, often: None, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    right, unlink, failures = whole(call), Path.unlink, [1 if name == "out.nc.run" else 2]
+    stopped(call, monkeypatch)
+
+    def fail(path: Path, missing_ok: bool = False) -> None:
+        if path.name == name and failures[0]:
+            failures[0] -= 1
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+        unlink(path, missing_ok)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", fail)
+        found = call("resume", str(OUT))
+    assert found.code == 0
+    assert f"warning: {name}: cannot be removed; out.nc is complete without it" in found.err
+    assert is_whole(right, name)
+    assert call("run", "e.json", "-o", str(OUT), "--force", "--quiet").code == 0
     assert is_whole(right)
 
 

@@ -229,7 +229,7 @@ class SimulationMachine(Counted):
 
     def check_records(self, dataset: Any, states: dict[int, State]) -> None:
         """Assert that the records are the states of the model. A state that was changed between
-        two steps is recorded as it was when the next step, or the end of the recording, followed."""
+        two steps is recorded as it was before the next step or at the end of the recording."""
         assert dataset["time"].values.tolist() == sorted(states)
         table = scene_of(self.kind).raster.table
         reference = dataset["reference"].values

@@ -461,7 +461,7 @@ class Bench:
             outcome.crashes[said.strip().splitlines()[-1] if said.strip() else str(code)] += 1
             killed = True
         yield from self._answered(kind, 0 if killed else code, said)
-        yield from self._standing(0 if killed else code, killed)
+        yield from self._standing(0 if killed else code, killed, said)
         if code:
             state = self._state()
             if state not in self._known:
@@ -487,13 +487,14 @@ class Bench:
         paths = (*self._start.rglob("*"), *self._whole.rglob("*"))
         return [path.name for path in paths] + [self.command.output]
 
-    def _standing(self, code: int, killed: bool) -> Iterator[str]:
-        """Check what is in the folder after the command."""
+    def _standing(self, code: int, killed: bool, said: str) -> Iterator[str]:
+        """Check what is in the folder after the command. A warning may name a file that cannot be
+        removed."""
         output = Path(self.command.output)
         whole, earlier = self._whole / output, self._start / output
         if not killed:
             left = [p for p in self._left() if not (LOGS if code == 0 else STORES).fullmatch(p)]
-            if left:
+            if left and not all(f"{p}: cannot be removed" in said for p in left):
                 yield f"exit {code}, left behind: {left}"
         if output.exists() and not (
             (killed or code) and earlier.exists() and not _same_bytes(output, earlier)
