@@ -74,6 +74,14 @@ LOOK = [
     ),
     click.option("--map", "cmap", metavar="NAME", help="Colour map of matplotlib, e.g. magma."),
     click.option(
+        "--window",
+        nargs=4,
+        type=float,
+        metavar="X0 X1 Y0 Y1",
+        default=None,
+        help="Part of the plane to draw, in the units of the axes.",
+    ),
+    click.option(
         "--size",
         "figsize",
         nargs=2,

@@ -17,7 +17,7 @@ from pbdkit.io.atomic_file import write
 from pbdkit.io.open import reading
 from pbdkit.io.other_files import is_experiment, refuse_other_file
 from pbdkit.plotting.movie import refuse_no_movie
-from pbdkit.plotting.style import figure_of
+from pbdkit.plotting.style import COMMAND_OPTIONS, figure_of
 from pbdkit.progress import progress_bar
 
 if TYPE_CHECKING:
@@ -60,15 +60,8 @@ def _plot_set_up(
     name: str, output: Path | None, settings: tuple[str, ...], *, force: bool, look: dict[str, Any]
 ) -> None:
     """Draw an experiment before it runs; raise ExperimentError for options of results."""
-    figsize, dpi = look.pop("figsize"), look.pop("dpi")
-    option_names = {
-        "filled": "field",
-        "times": "time",
-        "vmin": "range",
-        "vmax": "range",
-        "cmap": "map",
-        "norm": "scale",
-    }
+    page = {name: look.pop(name) for name in ("window", "figsize", "dpi")}
+    option_names = COMMAND_OPTIONS | {"times": "time"}
     if options := [
         option_names.get(key, key)
         for key, value in look.items()
@@ -82,7 +75,7 @@ def _plot_set_up(
     path = output or Path(f"{experiment.name.replace('/', '-')}-setup.png")
     refuse_output(path, force=force)
     refuse_unwritable(path)
-    axes = plotting.plot_experiment(experiment, figsize=figsize, dpi=dpi)
+    axes = plotting.plot_experiment(experiment, **page)
     save(path, figure_of(axes), replace=force)
 
 

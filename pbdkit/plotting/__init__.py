@@ -9,9 +9,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Literal
 
+from typing_extensions import Unpack
+
 from pbdkit.errors import refuse_no_matplotlib
 from pbdkit.plotting.movie import animate, animation
-from pbdkit.plotting.style import Limits, Norm, PlotOptions
+from pbdkit.plotting.style import PlotKeywords, PlotOptions, Window, takes_options
 
 if TYPE_CHECKING:
     import xarray
@@ -26,25 +28,14 @@ __all__ = [
 ]  # fmt: skip
 
 
+@takes_options()
 def plot(
     dataset: xarray.Dataset,
     color: str | None = None,
     time: float | Iterable[float | None] | None = None,
     *,
-    filled: bool | None = None,
-    contours: bool = False,
-    bonds: bool | None = None,
-    broken: bool = False,
-    outline: bool = False,
-    numbers: bool = False,
-    vmin: float | None = None,
-    vmax: float | None = None,
-    cmap: str | None = None,
-    norm: Norm = "linear",
-    limits: Limits = "all",
-    figsize: tuple[float, float] | None = None,
-    dpi: int = 200,
     ax: Axes | Sequence[Axes] | None = None,
+    **options: Unpack[PlotKeywords],
 ) -> Axes | list[Axes]:
     """Draw the configuration at recorded steps, coloured by a variable.
 
@@ -59,34 +50,7 @@ def plot(
         as `u_x`. By default the kinds of particles are drawn.
     time : float or iterable of float, optional
         Recorded step, or several steps, one for each panel; by default the last.
-    filled : bool, optional
-        True draws the variable as a filled field, False as a dot for each particle. By default a
-        field is drawn where dots would overlap.
-    contours : bool
-        Draw the field in filled contours at round levels.
-    bonds : bool, optional
-        Draw bonds as lines. By default they are drawn where there is room.
-    broken : bool
-        Draw broken bonds too, dashed.
-    outline : bool
-        Draw the outline of the body in the reference configuration.
-    numbers : bool
-        Write the numbers of particles where there is room.
-    vmin, vmax : float, optional
-        Limits of the colours. By default those of all drawn values, symmetric about zero if values
-        of both signs occur.
-    cmap : str, optional
-        Colour map of matplotlib.
-    norm : {"linear", "log", "sqrt", "symlog"}
-        Scale of the colours: linear; logarithmic, over at most four decades; square root, with the
-        sign of the value; or logarithmic on both sides of a linear range around zero.
-    limits : {"all", "each"}
-        "all" gives all steps the same limits of colours. "each" gives each step the limits of its
-        own values, which its title states.
-    figsize : (float, float), optional
-        Width and height of the figure in inches.
-    dpi : int
-        Pixels per inch.
+    {options}
     ax : Axes or sequence of Axes, optional
         Axes to draw into, one for each step. By default a new figure is created.
 
@@ -108,16 +72,14 @@ def plot(
     >>> ax = ds.pbd.plot("pe1", time=20, cmap="magma")
     >>> figure = ds.pbd.plot("pe1", time=[0, 20])
     """
-    look = PlotOptions(
-        filled, contours, bonds, broken, outline, numbers, vmin, vmax, cmap, norm,
-        limits, figsize, dpi,
-    )  # fmt: skip
+    look = PlotOptions(**options)
     refuse_no_matplotlib()
     from pbdkit.plotting.configuration import draw
 
     return draw(dataset, color, time, look, ax)
 
 
+@takes_options()
 def compare(
     first: xarray.Dataset,
     second: xarray.Dataset,
@@ -126,19 +88,7 @@ def compare(
     *,
     difference: bool = False,
     by: Literal["number", "site"] = "number",
-    filled: bool | None = None,
-    contours: bool = False,
-    bonds: bool | None = None,
-    broken: bool = False,
-    outline: bool = False,
-    numbers: bool = False,
-    vmin: float | None = None,
-    vmax: float | None = None,
-    cmap: str | None = None,
-    norm: Norm = "linear",
-    limits: Limits = "all",
-    figsize: tuple[float, float] | None = None,
-    dpi: int = 200,
+    **options: Unpack[PlotKeywords],
 ) -> Axes | list[Axes]:
     """Draw one step of two datasets side by side, or their difference.
 
@@ -160,34 +110,7 @@ def compare(
         Match the particles of a difference by number, or by site indices (i, j). In bodies of
         different shape the same number denotes particles at different sites, of which a warning is
         issued.
-    filled : bool, optional
-        True draws the variable as a filled field, False as a dot for each particle. By default a
-        field is drawn where dots would overlap.
-    contours : bool
-        Draw the field in filled contours at round levels.
-    bonds : bool, optional
-        Draw bonds as lines. By default they are drawn where there is room.
-    broken : bool
-        Draw broken bonds too, dashed.
-    outline : bool
-        Draw the outline of the body in the reference configuration.
-    numbers : bool
-        Write the numbers of particles where there is room.
-    vmin, vmax : float, optional
-        Limits of the colours. By default those of all drawn values, symmetric about zero if values
-        of both signs occur.
-    cmap : str, optional
-        Colour map of matplotlib.
-    norm : {"linear", "log", "sqrt", "symlog"}
-        Scale of the colours: linear; logarithmic, over at most four decades; square root, with the
-        sign of the value; or logarithmic on both sides of a linear range around zero.
-    limits : {"all", "each"}
-        "all" gives all steps the same limits of colours. "each" gives each step the limits of its
-        own values, which its title states.
-    figsize : (float, float), optional
-        Width and height of the figure in inches.
-    dpi : int
-        Pixels per inch.
+    {options}
 
     Returns
     -------
@@ -205,10 +128,7 @@ def compare(
     >>> second = pbdkit.run("paper/a-weighted", settings={"steps": 20}, progress=False)
     >>> left, right = first.pbd.compare(second, "pe1")
     """
-    look = PlotOptions(
-        filled, contours, bonds, broken, outline, numbers, vmin, vmax, cmap, norm,
-        limits, figsize, dpi,
-    )  # fmt: skip
+    look = PlotOptions(**options)
     refuse_no_matplotlib()
     from pbdkit.plotting.configuration import draw_comparison
 
@@ -219,6 +139,7 @@ def plot_experiment(
     experiment: Experiment,
     *,
     ax: Axes | None = None,
+    window: Window | None = None,
     figsize: tuple[float, float] | None = None,
     dpi: int = 200,
 ) -> Axes:
@@ -234,6 +155,8 @@ def plot_experiment(
         Experiment in the plane.
     ax : Axes, optional
         Axes to draw into. By default a new figure is created.
+    window : (float, float, float, float), optional
+        Part of the plane that is drawn: left, right, bottom and top, in the units of the axes.
     figsize : (float, float), optional
         Width and height of the figure in inches.
     dpi : int
@@ -256,7 +179,7 @@ def plot_experiment(
     refuse_no_matplotlib()
     from pbdkit.plotting.scene_axes import draw_experiment
 
-    return draw_experiment(experiment, PlotOptions(figsize=figsize, dpi=dpi), ax)
+    return draw_experiment(experiment, PlotOptions(window=window, figsize=figsize, dpi=dpi), ax)
 
 
 def crack(dataset: xarray.Dataset, kind: CrackKind = "map", *, ax: Axes | None = None) -> Axes:

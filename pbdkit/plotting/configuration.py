@@ -32,7 +32,7 @@ from pbdkit.plotting.data import (
     ReferenceBody,
     Snapshot,
     Trajectory,
-    coloured_rows,
+    coloured_values,
     combine,
     extent_of,
     of_one_run,
@@ -431,10 +431,10 @@ class PanelFigure:
     def _scale_within(self, body: ReferenceBody, snapshot: Snapshot) -> Scale:
         """Return the scale of one step."""
         assert self._scale is not None
-        rows = coloured_rows(body, self._quantity, in_body=self._style.filled)
-        return scale_within(
-            self._scale, self._quantity, value_range(snapshot.values, rows), self._look
+        values = coloured_values(
+            body, self._quantity, snapshot, self._look, in_body=self._style.filled
         )
+        return scale_within(self._scale, self._quantity, value_range(values), self._look)
 
     def _scale_of_all(self) -> Scale | None:
         if self._palette is not None:

@@ -715,23 +715,29 @@ def extent_of(recording: Trajectory, snapshots: Iterable[Snapshot], look: PlotOp
     reference = body.reference if look.outline else np.empty((0, 2))
     low, high = [reference.min(axis=0, initial=np.inf)], [reference.max(axis=0, initial=-np.inf)]
     inner, outer, kinds, classes = [], [], set[int](), set[int]()
-    inside = coloured_rows(body, quantity, in_body=True)
     for snapshot in snapshots:
         place = snapshot.position[np.isfinite(snapshot.position).all(axis=1)]
         low.append(place.min(axis=0, initial=np.inf))
         high.append(place.max(axis=0, initial=-np.inf))
-        kinds |= _numbers(snapshot.kind)
+        kinds |= _numbers(snapshot.kind[within(look.window, snapshot.position)])
         if snapshot.values is not None:
-            inner.append(value_range(snapshot.values, inside))
-            outer.append(value_range(snapshot.values))
+            shown = coloured_values(body, quantity, snapshot, look, in_body=False)
+            inner.append(value_range(coloured_values(body, quantity, snapshot, look, in_body=True)))
+            outer.append(value_range(shown))
             if quantity and quantity.words:
-                classes |= _numbers(snapshot.values)
+                classes |= _numbers(shown)
     lowest, highest = np.min(low, axis=0), np.max(high, axis=0)
     if not (lowest <= highest).all():
         raise ExperimentError("there are no positions to draw: all are NaN")
+    if look.window and not kinds:
+        edges = ", ".join(f"{edge:g}" for edge in look.window)
+        raise ExperimentError(
+            f"window: no particle lies within {edges}; the body extends from {lowest[0]:g} to "
+            f"{highest[0]:g} along x and from {lowest[1]:g} to {highest[1]:g} along y"
+        )
     margin = max(body.spacing, MARGIN * float(np.max(highest - lowest)))
     (xmin, ymin), (xmax, ymax) = lowest - margin, highest + margin
-    box = _no_thinner(xmin, xmax, ymin, ymax)
+    box = _no_thinner(*(look.window or (xmin, xmax, ymin, ymax)))
     return Extent(box, _joined(inner), _joined(outer), frozenset(kinds), frozenset(classes))
 
 
@@ -760,19 +766,35 @@ def _numbers(values: Array) -> set[int]:
     return {int(low) for low in np.flatnonzero(np.bincount(integers))}
 
 
-def coloured_rows(
-    body: ReferenceBody, quantity: PlottedQuantity | None, *, in_body: bool
-) -> Array | slice:
-    """Return the rows of the values that determine the limits of colours. With `in_body`, frame
-    points are excluded."""
-    of_particles = quantity is None or quantity.owner == "particle"
-    return body.inside if in_body and of_particles else slice(None)
+def within(window: Box | None, place: Array) -> Array:
+    """Return a mask of the places, (..., axis), that lie in a window. Without a window all do."""
+    if window is None:
+        return np.ones(place.shape[:-1], bool)
+    (left, right, bottom, top), (x, y) = window, np.moveaxis(place, -1, 0)
+    return np.asarray((left <= x) & (x <= right) & (bottom <= y) & (y <= top))
 
 
-def value_range(values: Array | None, rows: Array | slice = slice(None)) -> tuple[float, float]:
+def coloured_values(
+    body: ReferenceBody,
+    quantity: PlottedQuantity | None,
+    snapshot: Snapshot,
+    look: PlotOptions,
+    *,
+    in_body: bool,
+) -> Array:
+    """Return the values that determine the limits of colours: those in the window. A bond is in the
+    window if its midpoint is. With `in_body`, frame points are excluded."""
+    assert snapshot.values is not None
+    if quantity is not None and quantity.owner == "bond":
+        rows = within(look.window, snapshot.position[body.ends].mean(axis=1))
+    else:
+        rows = within(look.window, snapshot.position) & (body.inside | (not in_body))
+    return np.asarray(snapshot.values[rows])
+
+
+def value_range(values: Array) -> tuple[float, float]:
     """Return the lowest and the highest value. Both are NaN if there are no values."""
-    finite = np.empty(0) if values is None else values[rows]
-    finite = finite[np.isfinite(finite)]
+    finite = values[np.isfinite(values)]
     return (float(finite.min()), float(finite.max())) if len(finite) else (np.nan, np.nan)
 
 

@@ -378,7 +378,8 @@ def draw_numbers(ax: Axes, numbers: Array, snapshot: Snapshot, size: float) -> N
         xmax, ymax = xmin + (0.68 * len(text) * font + 1.5) * point, ymin + 1.25 * font * point
         columns = range(int(xmin / point), int(xmax / point) + 1)
         covered = {(c, r) for c in columns for r in range(int(ymin / point), int(ymax / point) + 1)}
-        if covered & occupied or xmax > box.x1 or ymax > box.y1:
+        is_within = box.x0 <= x and box.y0 <= y and xmax <= box.x1 and ymax <= box.y1
+        if covered & occupied or not is_within:
             continue
         occupied |= covered
         offset = (0.5 * size, 0.5 * size)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import Unpack
 
 from pbdkit.errors import (
     ExperimentError,
@@ -23,7 +24,7 @@ from pbdkit.errors import (
 from pbdkit.io.atomic_file import NewFile, encoding, open_atomic
 from pbdkit.io.layout import as_step
 from pbdkit.plotting.data import Extent, Snapshot, Trajectory, extent_of
-from pbdkit.plotting.style import Limits, Norm, PlotOptions
+from pbdkit.plotting.style import PlotKeywords, PlotOptions, takes_options
 
 if TYPE_CHECKING:
     import xarray
@@ -41,6 +42,8 @@ WRITERS = {"imageio_ffmpeg": "imageio-ffmpeg", "PIL": "pillow"}
 """Distributions of the modules that write movies."""
 DPI = 120
 """Resolution of a movie."""
+NOTEBOOK_DPI = 80
+"""Resolution of an animation for notebooks."""
 MAX_GIF_COLOURS = 128
 """Maximum number of colours of a GIF."""
 MIN_FRAME_RATE = 0.1
@@ -61,6 +64,7 @@ def silent(what: str, share: float) -> None:
     """Ignore the progress of a movie."""
 
 
+@takes_options("numbers", dpi=DPI)
 def animate(
     dataset: xarray.Dataset,
     color: str | None = None,
@@ -70,18 +74,7 @@ def animate(
     every: int = 1,
     show: Show = silent,
     replace: bool = True,
-    filled: bool | None = None,
-    contours: bool = False,
-    bonds: bool | None = None,
-    broken: bool = False,
-    outline: bool = False,
-    vmin: float | None = None,
-    vmax: float | None = None,
-    cmap: str | None = None,
-    norm: Norm = "linear",
-    limits: Limits = "all",
-    figsize: tuple[float, float] | None = None,
-    dpi: int = DPI,
+    **options: Unpack[PlotKeywords],
 ) -> None:
     """Write a movie of the recorded steps, with one scale of colours for the whole run.
 
@@ -101,32 +94,7 @@ def animate(
         Function that is called with a text and the completed fraction, from 0 to 1.
     replace : bool
         Replace an existing file.
-    filled : bool, optional
-        True draws the variable as a filled field, False as a dot for each particle. By default a
-        field is drawn where dots would overlap.
-    contours : bool
-        Draw the field in filled contours at round levels.
-    bonds : bool, optional
-        Draw bonds as lines. By default they are drawn where there is room.
-    broken : bool
-        Draw broken bonds too, dashed.
-    outline : bool
-        Draw the outline of the body in the reference configuration.
-    vmin, vmax : float, optional
-        Limits of the colours. By default those of all drawn values, symmetric about zero if values
-        of both signs occur.
-    cmap : str, optional
-        Colour map of matplotlib.
-    norm : {"linear", "log", "sqrt", "symlog"}
-        Scale of the colours: linear; logarithmic, over at most four decades; square root, with the
-        sign of the value; or logarithmic on both sides of a linear range around zero.
-    limits : {"all", "each"}
-        "all" gives all steps the same limits of colours. "each" gives each step the limits of its
-        own values, which its title states.
-    figsize : (float, float), optional
-        Width and height of the figure in inches.
-    dpi : int
-        Pixels per inch.
+    {options}
 
     Raises
     ------
@@ -143,10 +111,7 @@ def animate(
     path = _movie_file(color, file)
     refuse_no_movie(path)
     _refuse_speed(path, fps, every)
-    look = PlotOptions(
-        filled, contours, bonds, broken, outline, False, vmin, vmax, cmap, norm,
-        limits, figsize, dpi,
-    )  # fmt: skip
+    look = PlotOptions(**options)
     recording = Trajectory(dataset, color or "kind")
     rows = [*range(0, len(recording.steps), every)]
     rows += [] if rows[-1] == len(recording.steps) - 1 else [len(recording.steps) - 1]
@@ -188,22 +153,11 @@ def _movie_file(color: str | None, file: str | Path | None) -> Path:
     )
 
 
+@takes_options("numbers", dpi=NOTEBOOK_DPI)
 def animation(
     dataset: xarray.Dataset,
     color: str | None = None,
-    *,
-    filled: bool | None = None,
-    contours: bool = False,
-    bonds: bool | None = None,
-    broken: bool = False,
-    outline: bool = False,
-    vmin: float | None = None,
-    vmax: float | None = None,
-    cmap: str | None = None,
-    norm: Norm = "linear",
-    limits: Limits = "all",
-    figsize: tuple[float, float] | None = None,
-    dpi: int = 80,
+    **options: Unpack[PlotKeywords],
 ) -> FuncAnimation:
     """Return an animation of matplotlib, for notebooks.
 
@@ -213,32 +167,7 @@ def animation(
         Result of one run. At most 60 of its recorded steps are drawn, evenly spaced.
     color : str, optional
         Variable of particles or bonds, as for `plot`.
-    filled : bool, optional
-        True draws the variable as a filled field, False as a dot for each particle. By default a
-        field is drawn where dots would overlap.
-    contours : bool
-        Draw the field in filled contours at round levels.
-    bonds : bool, optional
-        Draw bonds as lines. By default they are drawn where there is room.
-    broken : bool
-        Draw broken bonds too, dashed.
-    outline : bool
-        Draw the outline of the body in the reference configuration.
-    vmin, vmax : float, optional
-        Limits of the colours. By default those of all drawn values, symmetric about zero if values
-        of both signs occur.
-    cmap : str, optional
-        Colour map of matplotlib.
-    norm : {"linear", "log", "sqrt", "symlog"}
-        Scale of the colours: linear; logarithmic, over at most four decades; square root, with the
-        sign of the value; or logarithmic on both sides of a linear range around zero.
-    limits : {"all", "each"}
-        "all" gives all steps the same limits of colours. "each" gives each step the limits of its
-        own values, which its title states.
-    figsize : (float, float), optional
-        Width and height of the figure in inches.
-    dpi : int
-        Pixels per inch.
+    {options}
 
     Returns
     -------
@@ -253,10 +182,7 @@ def animation(
     refuse_no_matplotlib()
     from matplotlib.animation import FuncAnimation
 
-    look = PlotOptions(
-        filled, contours, bonds, broken, outline, False, vmin, vmax, cmap, norm,
-        limits, figsize, dpi,
-    )  # fmt: skip
+    look = PlotOptions(**options)
     recording = Trajectory(dataset, color or "kind")
     last = len(recording.steps) - 1
     rows = np.unique(

@@ -100,6 +100,7 @@ def draw_experiment(experiment: Experiment, look: PlotOptions, ax: Axes | None) 
     size = np.maximum(high - low, 1e-9 * max(1.0, *np.abs(high), *np.abs(low)))
     margin = MARGIN / ((np.array(MAX_SIZE_PX) - 2.0 * MARGIN) / size).min()
     (xmin, ymin), (xmax, ymax) = unit * (low - margin), unit * (high + margin)
+    xmin, xmax, ymin, ymax = look.window or (xmin, xmax, ymin, ymax)
     title, labels = plain(experiment.name), (label("x", words), label("y", words))
     if ax is not None:
         ax.set(xlim=(xmin, xmax), ylim=(ymin, ymax), aspect="equal", title=title)

@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+import inspect
 import math
+import re
 import textwrap
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from functools import wraps
 from numbers import Real
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, TypedDict, TypeVar, cast, get_args
 
 import numpy as np
 
-from pbdkit.errors import ExperimentError, one_line
+from pbdkit.errors import ExperimentError, did_you_mean, one_line
 from pbdkit.io.physical import FACTOR, UNITS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.backend_bases import RendererBase
     from matplotlib.figure import Figure
+
+
+F = TypeVar("F", bound=Callable[..., Any])
 
 
 def figure_of(ax: Axes) -> Figure:
@@ -97,6 +103,62 @@ Norm = Literal["linear", "log", "sqrt", "symlog"]
 """Names of scales of colours, as in matplotlib."""
 Limits = Literal["all", "each"]
 """Scope of the limits of colours: all drawn steps, or each of them."""
+Window = tuple[float, float, float, float]
+"""Part of the plane: left, right, bottom and top, in the units of the axes."""
+
+
+class PlotKeywords(TypedDict, total=False):
+    """Types of the options of pictures and movies, as keyword arguments."""
+
+    filled: bool | None
+    contours: bool
+    bonds: bool | None
+    broken: bool
+    outline: bool
+    numbers: bool
+    vmin: float | None
+    vmax: float | None
+    cmap: str | None
+    norm: Norm
+    limits: Limits
+    window: Window | None
+    figsize: tuple[float, float] | None
+    dpi: int
+
+
+OPTIONS = """
+    filled : bool, optional
+        True draws the variable as a filled field, False as a dot for each particle. By default a
+        field is drawn where dots would overlap.
+    contours : bool
+        Draw the field in filled contours at round levels.
+    bonds : bool, optional
+        Draw bonds as lines. By default they are drawn where there is room.
+    broken : bool
+        Draw broken bonds too, dashed.
+    outline : bool
+        Draw the outline of the body in the reference configuration.
+    numbers : bool
+        Write the numbers of particles where there is room.
+    vmin, vmax : float, optional
+        Limits of the colours. By default those of all drawn values, symmetric about zero if values
+        of both signs occur.
+    cmap : str, optional
+        Colour map of matplotlib.
+    norm : {"linear", "log", "sqrt", "symlog"}
+        Scale of the colours: linear; logarithmic, over at most four decades; square root, with the
+        sign of the value; or logarithmic on both sides of a linear range around zero.
+    limits : {"all", "each"}
+        "all" gives all steps the same limits of colours. "each" gives each step the limits of its
+        own values, which its title states.
+    window : (float, float, float, float), optional
+        Part of the plane that is drawn: left, right, bottom and top, in the units of the axes.
+    figsize : (float, float), optional
+        Width and height of the figure in inches.
+    dpi : int
+        Pixels per inch.
+"""
+"""Description of the options in the docstrings of the functions that take them."""
 
 
 @dataclass(frozen=True)
@@ -118,11 +180,13 @@ class PlotOptions:
     cmap: str | None = None
     norm: Norm = "linear"
     limits: Limits = "all"
+    window: Window | None = None
     figsize: tuple[float, float] | None = None
     dpi: int = 200
 
     def __post_init__(self) -> None:
         self._check_limits()
+        self._check_window()
         if self.figsize is not None:
             sizes = [s for s in np.atleast_1d(self.figsize) if is_number(s)]
             if len(sizes) != 2 or not all(0.0 < s <= MAX_SIZE_IN for s in sizes):
@@ -144,6 +208,16 @@ class PlotOptions:
                 "limits='each' determines the limits of each step; omit it, or vmin and vmax"
             )
 
+    def _check_window(self) -> None:
+        if self.window is None:
+            return
+        edges = [edge for edge in np.atleast_1d(self.window) if is_number(edge)]
+        if len(edges) != 4 or not (edges[0] < edges[1] and edges[2] < edges[3]):
+            raise ExperimentError(
+                "window: expected left, right, bottom and top, with left below right and bottom "
+                f"below top; got {self.window!r}"
+            )
+
     def _check_limits(self) -> None:
         for name, limit in (("vmin", self.vmin), ("vmax", self.vmax)):
             if limit is not None and not is_number(limit):
@@ -152,6 +226,55 @@ class PlotOptions:
             raise ExperimentError(
                 f"colour limits: vmin {self.vmin:g} is not below vmax {self.vmax:g}; exchange them"
             )
+
+
+COMMAND_OPTIONS = {
+    "filled": "field", "vmin": "range", "vmax": "range", "cmap": "map", "norm": "scale",
+    "figsize": "size",
+}  # fmt: skip
+"""Names on the command line of those arguments that have another name there."""
+OTHER_NAMES = {option: name for name, option in COMMAND_OPTIONS.items()} | {"colormap": "cmap"}
+"""Arguments by other names for them."""
+
+
+def takes_options(*without: str, dpi: int = PlotOptions.dpi) -> Callable[[F], F]:
+    """Return a decorator for functions with the keyword arguments `PlotKeywords`.
+
+    The signature and the docstring of the function then contain these options, except those in
+    `without`. A call with another keyword argument raises TypeError.
+    """
+
+    def decorate(function: F) -> F:
+        own = inspect.signature(function)
+        defaults = {part.name: part.default for part in fields(PlotOptions)} | {"dpi": dpi}
+        keywords = [
+            inspect.Parameter(
+                part.name, inspect.Parameter.KEYWORD_ONLY, default=defaults[part.name],
+                annotation=part.type,
+            )
+            for part in fields(PlotOptions) if part.name not in without
+        ]  # fmt: skip
+        parameters = [p for p in own.parameters.values() if p.kind is not p.VAR_KEYWORD]
+        last = len(parameters) - (parameters[-1].name == "ax")
+        parameters[last:last] = keywords
+
+        @wraps(function)
+        def call(*args: Any, **options: Any) -> Any:
+            names = [p.name for p in parameters]
+            for name in options.keys() - {*names}:
+                hint = did_you_mean(name, names) or f"; there are {', '.join(names[1:])}"
+                if name in OTHER_NAMES:
+                    hint = f"; did you mean '{OTHER_NAMES[name]}'?"
+                raise TypeError(f"{function.__name__}: there is no argument '{name}'{hint}")
+            return function(*args, **{"dpi": dpi} | options)
+
+        entries = re.split(r"\n(?=    \w)", OPTIONS.strip("\n"))
+        text = "\n".join(entry for entry in entries if entry.split()[0] not in without)
+        call.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]
+        call.__doc__ = (function.__doc__ or "").replace("    {options}", text)
+        return cast(F, call)
+
+    return decorate
 
 
 def is_number(value: Any) -> bool:

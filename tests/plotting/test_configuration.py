@@ -6,6 +6,7 @@ from dataclasses import fields
 from inspect import Parameter, signature
 from itertools import combinations
 from pathlib import Path as FilePath
+from typing import get_type_hints
 
 import numpy as np
 import pytest
@@ -21,10 +22,10 @@ from matplotlib.figure import Figure
 from matplotlib.path import Path
 from matplotlib.text import Text
 
-from pbdkit.plotting import animate, animation, compare, plot
+from pbdkit.plotting import animate, animation, compare, plot, plot_experiment
 from pbdkit.plotting.data import Trajectory, cells_of, distance_from, outline, whole
 from pbdkit.plotting.layers import PixelGrid
-from pbdkit.plotting.style import PlotOptions
+from pbdkit.plotting.style import PlotKeywords, PlotOptions
 
 HOLD = {"select": {"edge": "left"}, "motion": {"type": "hold"}}
 SIDEWAYS = {"type": "velocity", "velocity": [0.3, 0.1], "steps": 10}
@@ -601,10 +602,32 @@ def test_figures_belong_to_pyplot_if_it_is_in_use(tmp_path):
     assert len(plt.get_fignums()) == before + 2
 
 
+WINDOW = (1.5, 5.5, -0.5, 3.5)
+
+
+def test_window_limits_picture_colours_and_legend():
+    ds = pbdkit.run(pbdkit.load("paper/a", settings=["steps=3"]), progress=False)
+    ax = plot(ds, "reference_x", window=WINDOW)
+    assert (*ax.get_xlim(), *ax.get_ylim()) == WINDOW
+    dots = next(c for c in ax.collections if isinstance(c, PathCollection))
+    assert dots.norm.vmin <= 2.0 < 5.0 <= dots.norm.vmax < 6.0
+    legend = plot(ds, window=WINDOW).figure.legends[0]
+    assert [text.get_text() for text in legend.get_texts()] == ["follower"]
+    assert plot_experiment(pbdkit.load("paper/a"), window=WINDOW).get_xlim() == WINDOW[:2]
+    with pytest.raises(pbdkit.ExperimentError, match="the body extends from -1 to 1"):
+        plot(ds, window=(50, 60, 0, 1))
+    with pytest.raises(pbdkit.ExperimentError, match="window: expected left, right, bottom and"):
+        plot(ds, window=(5, 1, 0, 1))
+
+
 @pytest.mark.parametrize("verb", [plot, compare, animate, animation], ids=lambda v: v.__name__)
 def test_plots_share_documented_keyword_options(verb):
     """An editor completes them, with types; `numbers` is not legible in movies."""
     options = {part.name: part.type for part in fields(PlotOptions)}
+    keywords = get_type_hints(PlotKeywords)
+    assert keywords == {n: hint for n, hint in get_type_hints(PlotOptions).items() if n in options}
+    with pytest.raises(TypeError, match="no argument 'colormap'; did you mean 'cmap'"):
+        verb(None, colormap="magma")
     if verb in (animate, animation):
         del options["numbers"]
     parameters = signature(verb).parameters
