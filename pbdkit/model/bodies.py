@@ -120,7 +120,7 @@ class Rectangle(Body):
         return [Box((x, y), (x + self.width, y + self.height))]
 
     def area(self) -> Geometry:
-        """Return the rectangle."""
+        """Return the rectangle as an area, with the corners of its box."""
         return _box(*self.boxes())
 
     def distance(self, sites: Sites) -> Floats:
@@ -144,7 +144,7 @@ class Disc(Body):
         return [_square(self.centre, self.radius)]
 
     def area(self) -> Geometry:
-        """Return the disc."""
+        """Return the disc as a polygon with `ARC_SIDES` sides in each quarter."""
         return _disc(self.centre, self.radius)
 
     def distance(self, sites: Sites) -> Floats:
@@ -199,7 +199,7 @@ class Polygon(Body):
         return self
 
     def area(self) -> Geometry:
-        """Return the polygon."""
+        """Return the area within the vertices."""
         from shapely import Polygon as Outline
 
         return Outline(self.vertices)
