@@ -46,6 +46,10 @@ CORRECTION = "correction, "
 """Prefix of the kind of a bound on the error that remains after a computed correction."""
 
 
+PRESCRIBED = "the largest prescribed displacement"
+"""Meaning of the scale of errors if leaders or the initial state prescribe displacements."""
+
+
 @dataclass(frozen=True)
 class ErrorBound:
     """A posteriori bound on the error of an equilibrium.
@@ -63,12 +67,14 @@ class ErrorBound:
     distance : float
         Bound on the distance of any follower from equilibrium, in lattice units.
     share : float
-        The distance divided by the largest prescribed displacement.
+        The distance divided by the displacement that `scale` names.
     bound : str
         Kind of the bound.
     linearised : bool
         True if the rule is not linear. The bound is then computed from the linearisation and
         multiplied by a safety factor of 2.
+    scale : str
+        Displacement to which `share` refers, in words; not part of `as_dict`.
     """
 
     method: str
@@ -79,6 +85,7 @@ class ErrorBound:
     share: float
     bound: str
     linearised: bool
+    scale: str = PRESCRIBED
 
     def as_dict(self) -> dict[str, Any]:
         """Return the bound as plain values, for JSON.
@@ -88,15 +95,15 @@ class ErrorBound:
         dict
             Values by name.
         """
-        return asdict(self)
+        return {name: value for name, value in asdict(self).items() if name != "scale"}
 
     def __str__(self) -> str:
         description = BOUND_KINDS[self.bound.removeprefix(CORRECTION)]
         if self.bound.startswith(CORRECTION):
             description = f"the correction to it; the error after it is bounded by {description}"
         return (
-            f"within {self.distance:.2g} of equilibrium ({self.share:.1g} of the largest "
-            f"prescribed displacement), by {description}"
+            f"within {self.distance:.2g} of equilibrium ({self.share:.1g} of {self.scale}), by "
+            f"{description}"
         )
 
 
@@ -126,13 +133,30 @@ class RoundingError(UnconvergedError):
     """A state is as near to an equilibrium as rounding permits, but not within the tolerance."""
 
 
-def scale_of(scene: Scene, start: State, rows: Rows = ALL) -> float:
+class DisplacementScale(float):
+    """Displacement to which errors of equilibria refer, in lattice units, and its `meaning`."""
+
+    meaning: str
+
+    @classmethod
+    def of(cls, value: float, meaning: str) -> DisplacementScale:
+        """Return a displacement with a meaning."""
+        scale = cls(value)
+        scale.meaning = meaning
+        return scale
+
+
+def scale_of(scene: Scene, start: State, rows: Rows = ALL) -> DisplacementScale:
     """Return the largest displacement that leaders or the initial state prescribe. If all are zero,
     return the largest displacement caused by loads; without loads, the length of the shortest
     bond."""
     offsets = [largest_offset(leading, scene.experiment.steps) for leading in scene.driven]
     prescribed = rows.communicator.largest(max([rows.max_norm(start.u), *offsets]))
-    return prescribed or _displacement_under_loads(scene, start, rows) or spacing_of(scene)
+    if prescribed:
+        return DisplacementScale.of(prescribed, PRESCRIBED)
+    if under_loads := _displacement_under_loads(scene, start, rows):
+        return DisplacementScale.of(under_loads, "the largest displacement under the loads")
+    return DisplacementScale.of(spacing_of(scene), "the length of the shortest bond")
 
 
 def _displacement_under_loads(scene: Scene, rest: State, rows: Rows) -> float:
@@ -203,7 +227,7 @@ class EquilibriumPredictor:
     the results of iterative solvers would depend on earlier solutions.
     """
 
-    def __init__(self, scene: Scene, scale: float, watch: Watch) -> None:
+    def __init__(self, scene: Scene, scale: DisplacementScale, watch: Watch) -> None:
         self._scene, self._scale, self._watch = scene, scale, watch
         self._moves = Moves(scene)
         self._at_rest: System | None = None
@@ -269,6 +293,7 @@ class EquilibriumPredictor:
             share=distance / self._scale,
             bound=CORRECTION + system.bound_kind,
             linearised=relinearised,
+            scale=self._scale.meaning,
         )
         return PredictedEquilibrium(ahead, error_bound, obstacle)
 

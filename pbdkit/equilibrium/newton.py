@@ -21,6 +21,7 @@ from pbdkit.equilibrium.error_bound import (
     FIRST_ORDER,
     LINEAR,
     UNKNOWN,
+    DisplacementScale,
     ErrorBound,
     RoundingError,
     UnconvergedError,
@@ -101,7 +102,7 @@ class Finder:
 
     scene: Scene
     tolerance: float
-    scale: float
+    scale: DisplacementScale
     method: str
     watch: Watch
     compiles: bool = True
@@ -248,6 +249,7 @@ class Search(ABC):
             share=distance / self._finder.scale,
             bound=self._system.bound_kind,
             linearised=not self._linear,
+            scale=self._finder.scale.meaning,
         )
 
     def _why(self, best: float) -> str:

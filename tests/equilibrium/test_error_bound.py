@@ -176,6 +176,22 @@ def test_finished_load_does_not_delay_the_end():
     assert 60 < steps_of(ds) < 600
 
 
+def test_reason_names_the_displacement_to_which_the_error_refers():
+    load = {"select": {"edge": "top"}, "force": [0.0, 0.01]}
+    parts = {
+        "rule": {"type": "springs"},
+        "frame": {"type": "natural"},
+        "steps": 1,
+        "neighbours": {"type": "chebyshev", "shells": 1},
+        "solver": {"type": "equilibrium"},
+    }
+    loaded = pbdkit.run(experiment(leaders=[HOLD_LEFT], loads=[load], **parts), progress=False)
+    assert " of the largest displacement under the loads), by" in loaded.attrs["stop_reason"]
+    assert "scale" not in error_bound(loaded)
+    held = pbdkit.run(experiment(leaders=[HOLD_LEFT], **parts), progress=False)
+    assert " of the length of the shortest bond), by" in held.attrs["stop_reason"]
+
+
 def test_body_at_rest_converges_in_the_first_step():
     ds = run(sheet(leaders=BOTH_ENDS_HELD))
     assert (ds.attrs["status"], steps_of(ds), error_bound(ds)["distance"]) == ("settled", 1, 0.0)

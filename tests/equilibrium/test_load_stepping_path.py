@@ -9,7 +9,7 @@ from hypothesis import given, strategies as st
 from scene_strategies import in_turn, samples
 
 import pbdkit
-from pbdkit.equilibrium.error_bound import EquilibriumPredictor
+from pbdkit.equilibrium.error_bound import DisplacementScale, EquilibriumPredictor
 from pbdkit.equilibrium.linearise import linearised
 from pbdkit.equilibrium.load_stepping import equilibrate, events, moments
 from pbdkit.equilibrium.system import Moves
@@ -174,7 +174,7 @@ def test_first_order_bounds_are_doubled():
     assert error_bound.linearised
     assert error_bound.distance == pytest.approx(2.0 * once, rel=0.1)
     state.u[...] += moves.at(state, 1) + 1e-4 * np.sin(state.u)  # off by a little
-    found = EquilibriumPredictor(scene, 1.0, Watch()).predict(state)
+    found = EquilibriumPredictor(scene, DisplacementScale.of(1.0, "1"), Watch()).predict(state)
     system = linearised(scene, state, 1, "auto", Watch())
     correction = found.u - state.u
     left = system.distance(moves.at(type(state)(**vars(state) | {"u": found.u}), 1),
