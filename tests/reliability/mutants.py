@@ -5,6 +5,11 @@ to a copy of the repository. A process that is forked from a prepared one execut
 cover the changed statement, cheapest first, until one of them fails. Which tests cover a statement,
 and what each test costs, is measured once for each state of the repository.
 
+At first the prepared process has imported the tests and pbdkit, and the changed function gets its
+new code there, if that is possible. Other mutants, and those that survive, are repeated in
+processes that import the changed file, with more tests. Survivors that change no result are
+described in equivalent_mutants.yaml.
+
     pip install --group nightly
     python tests/reliability/mutants.py --count 500 --seed 1
 """
@@ -12,9 +17,11 @@ and what each test costs, is measured once for each state of the repository.
 from __future__ import annotations
 
 import argparse
+import difflib
 import gc
 import hashlib
 import importlib
+import inspect
 import json
 import os
 import random
@@ -27,8 +34,10 @@ import time
 import traceback
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
+from functools import cache, partial
 from pathlib import Path
+from types import CodeType, FunctionType
 from typing import Any, NamedTuple
 
 import parso
@@ -38,8 +47,10 @@ from cosmic_ray.mutating import mutate_code
 from cosmic_ray.operators.operator import Operator
 from cosmic_ray.plugins import get_operator
 from parso.python.tree import FStringString, String
+from ruamel.yaml import YAML
 
 ROOT = Path(__file__).parents[2]
+EQUIVALENT = Path(__file__).with_name("equivalent_mutants.yaml")
 AREAS = {
     "evaluator": [
         "stepping/rule_evaluation.py",
@@ -130,12 +141,21 @@ TEXT_FOLDERS = ("numba_engine", "stepping")
 """Folders in which strings are parts of kernels."""
 LONGEST_TEST_S = 8.0
 """Processor time above which a test is not executed."""
+LIMIT_S = 5.0
+"""Processor time after which a test is ended, in addition to four times what it needs."""
+COMPILATION_S = 25.0
+"""The same for areas with code that is compiled."""
+COMPILED = ("evaluator", "engines")
+LONGEST_SLEEP_S = 100.0
+"""Time after which a process that uses no processor is ended."""
 OPTIONS = ["-q", "-p", "no:cacheprovider", "-o", "addopts="]
 """Options of pytest, without those of the project."""
 OPTIONS += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]  # Packages are already imported.
 GOAL = 0.9
 FAULT = 70
 """Exit status of a process in which pytest itself failed."""
+UNCHANGED = 71
+"""Exit status of a process in which no function could be replaced."""
 
 
 class KernelText(Operator):  # type: ignore[misc]
@@ -184,10 +204,24 @@ class Mutant(NamedTuple):
 
     def code(self) -> str:
         """Return the source with the change."""
-        source = (ROOT / self.path).read_text()
-        code = mutate_code(source, _operator(self.operator), self.occurrence)
-        assert code is not None
-        return str(code)
+        return _code(self.path, self.operator, self.occurrence)
+
+    def change(self) -> tuple[str, str, str]:
+        """Return the file, the changed line and the line that replaces it."""
+        before = (ROOT / self.path).read_text().splitlines()
+        after = self.code().splitlines()
+        old, new = (
+            " ".join(line[2:].strip() for line in difflib.ndiff(before, after) if line[0] == sign)
+            for sign in "-+"
+        )
+        return self.path.removeprefix("pbdkit/"), old, new
+
+
+@cache
+def _code(path: str, operator: str, occurrence: int) -> str:
+    code = mutate_code((ROOT / path).read_text(), _operator(operator), occurrence)
+    assert code is not None
+    return str(code)
 
 
 def _operator(name: str) -> Operator:
@@ -283,10 +317,13 @@ class Recording:
 
     @pytest.hookimpl(hookwrapper=True)
     def pytest_runtest_protocol(self, item: Any) -> Iterator[None]:
-        """Execute a test in a context of its own."""
+        """Execute a test in a context of its own, and end it if it is too long to be used."""
         self.coverage.switch_context(item.nodeid)
         begun = time.process_time()
+        signal.signal(signal.SIGPROF, lambda *_: pytest.fail("too long"))
+        signal.setitimer(signal.ITIMER_PROF, 1.5 * LONGEST_TEST_S)
         yield
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
         self.cost[item.nodeid] = time.process_time() - begun
         self.coverage.switch_context("")
 
@@ -334,10 +371,12 @@ def test_files() -> list[str]:
 
 
 class Selection:
-    """A plugin of pytest that executes selected tests in the given order."""
+    """A plugin of pytest that executes selected tests in the order of their limits, which are given
+    in seconds of processor time. A longer test ends the process."""
 
-    def __init__(self, names: Sequence[str]) -> None:
-        self.order = {name: n for n, name in enumerate(names)}
+    def __init__(self, limits: dict[str, float]) -> None:
+        self.limits = limits
+        self.order = {name: n for n, name in enumerate(limits)}
 
     def pytest_collection_modifyitems(self, items: list[Any]) -> None:
         """Keep the selected tests, in their order."""
@@ -346,15 +385,21 @@ class Selection:
             key=lambda item: self.order[item.nodeid],
         )
 
+    @pytest.hookimpl(hookwrapper=True)
+    def pytest_runtest_protocol(self, item: Any) -> Iterator[None]:
+        """Execute a test with its limit."""
+        signal.setitimer(signal.ITIMER_PROF, self.limits[item.nodeid])
+        yield
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+
 
 class Coverage:
     """Processor time and covered lines of each test, as recorded."""
 
-    def __init__(self, records: Sequence[Path], patience_s: float) -> None:
+    def __init__(self, records: Sequence[Path]) -> None:
         self.cost: dict[str, float] = {}
         self.lines: dict[str, dict[int, set[str]]] = defaultdict(lambda: defaultdict(set))
         self.modules: dict[str, None] = {}
-        self.patience_s = patience_s
         for path in records:
             kept = json.loads(path.read_text())
             self.cost |= kept["cost"]
@@ -364,7 +409,7 @@ class Coverage:
                 for line, tests in lines.items():
                     self.lines[source][int(line)].update(names[n] for n in tests)
 
-    def tests(self, mutant: Mutant) -> tuple[list[str], list[str]]:
+    def tests(self, mutant: Mutant, patience_s: float) -> tuple[list[str], list[str]]:
         """Return tests that execute the statement: those of the file that mirrors the source, and
         the others. One case of each function comes before further cases, and the files take turns,
         each with its cheapest test first, until the time is used up.
@@ -391,29 +436,95 @@ class Coverage:
         total = 0.0
         for away, *_, cost, name in sorted(ranked):
             total += cost
-            if total > self.patience_s and total > cost:
+            if total > patience_s and total > cost:
                 break
             chosen[away].append(name)
         return chosen
 
 
-def execute(parts: Iterable[Sequence[str]]) -> int:
+def execute(parts: Iterable[dict[str, float]]) -> int:
     """Execute tests in this process, part by part, until one fails."""
+    signal.signal(signal.SIGPROF, signal.SIG_DFL)
     for part in filter(None, parts):
         files = sorted({name.split("::")[0] for name in part})
-        if code := pytest.main([*OPTIONS, "-x", *files], plugins=[Selection(part)]):
+        code = pytest.main([*OPTIONS, "-x", *files], plugins=[Selection(part)])
+        if code not in (pytest.ExitCode.OK, pytest.ExitCode.NO_TESTS_COLLECTED):
             return int(code)
     return 0
 
 
-def judged(work: Any, limit_s: float, log: Path) -> str:
+Codes = dict[tuple[str, str, int], CodeType]
+"""Codes of functions by file, qualified name and first line."""
+Functions = dict[tuple[str, str, int], list[FunctionType]]
+
+
+def _nested(code: CodeType) -> list[CodeType]:
+    """Return the code of each function and class that is defined directly in a code."""
+    return [value for value in code.co_consts if isinstance(value, CodeType)]
+
+
+def _body(code: CodeType) -> tuple[Any, ...]:
+    """Return what a code does, without the functions and classes that it defines."""
+    constants = [repr(value) for value in code.co_consts if not isinstance(value, CodeType)]
+    return code.co_code, constants, code.co_names, code.co_varnames, code.co_freevars
+
+
+def _whole(code: CodeType) -> tuple[Any, ...]:
+    return *_body(code), *map(_whole, _nested(code))
+
+
+def _collect(code: CodeType, codes: Codes) -> None:
+    codes[code.co_filename, code.co_qualname, code.co_firstlineno] = code
+    for part in _nested(code):
+        _collect(part, codes)
+
+
+def changed_functions(old: CodeType, new: CodeType, codes: Codes) -> bool:
+    """Collect the codes of the functions of a module or a class that differ, and of the functions
+    in them. Return False if the body of the module or of a class differs: it runs at the import."""
+    if _body(old) != _body(new):
+        return False
+    for a, b in zip(_nested(old), _nested(new), strict=True):
+        if _whole(a) != _whole(b):
+            if not a.co_flags & inspect.CO_OPTIMIZED:
+                if not changed_functions(a, b, codes):
+                    return False
+            elif a.co_name.startswith("<") and a.co_name != "<lambda>":
+                return False
+            else:
+                _collect(b, codes)
+    return True
+
+
+def imported_functions(folder: Path) -> Functions:
+    """Return the functions of the imported files in a folder."""
+    functions: Functions = defaultdict(list)
+    for value in gc.get_objects():
+        if isinstance(value, FunctionType) and value.__code__.co_filename.startswith(str(folder)):
+            code = value.__code__
+            functions[code.co_filename, code.co_qualname, code.co_firstlineno].append(value)
+    return functions
+
+
+def replace_functions(functions: Functions, path: Path, old: str, new: str) -> bool:
+    """Give the functions of an imported file their new code; return whether that was possible."""
+    codes: Codes = {}
+    before, after = (compile(text, str(path), "exec") for text in (old, new))
+    if "njit" in old or not changed_functions(before, after, codes) or not codes:
+        return False
+    for key, code in codes.items():
+        for function in functions.get(key, ()):
+            function.__code__ = code
+    return next(iter(codes)) in functions
+
+
+def judged(work: Any, log: Path) -> str:
     """Return the result of a mutant: `killed`, `timeout` or `survived`."""
     pid = os.fork()
     if pid == 0:
         os.setsid()
         for stream in (1, 2):
             os.dup2(os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND), stream)
-        resource.setrlimit(resource.RLIMIT_CPU, (int(limit_s), int(limit_s)))
         resource.setrlimit(resource.RLIMIT_AS, (8 << 30, 8 << 30))
         code = FAULT
         try:
@@ -422,10 +533,12 @@ def judged(work: Any, limit_s: float, log: Path) -> str:
             traceback.print_exc()
         finally:
             os._exit(code)
-    end, status = time.monotonic() + 4 * limit_s, None
-    while status is None and time.monotonic() < end:
+    status, used, last = None, "", time.monotonic()
+    while status is None and time.monotonic() < last + LONGEST_SLEEP_S:
         done, value = os.waitpid(pid, os.WNOHANG)
         status = value if done else None
+        if not done and used != (now := _used(pid)):
+            used, last = now, time.monotonic()
         time.sleep(0.01)
     with suppress(ProcessLookupError):
         os.killpg(pid, signal.SIGKILL)
@@ -435,9 +548,16 @@ def judged(work: Any, limit_s: float, log: Path) -> str:
     code = os.waitstatus_to_exitcode(status)
     if code == FAULT:
         raise RuntimeError(f"the tests could not be executed: {log}")
-    if code in (-signal.SIGKILL, -signal.SIGXCPU):
+    if code == UNCHANGED:
+        return "unchanged"
+    if code in (-signal.SIGKILL, -signal.SIGPROF):
         return "timeout"
     return "survived" if code == 0 else "killed"
+
+
+def _used(pid: int) -> str:
+    """Return the processor time of a process, in the units of the kernel."""
+    return " ".join(Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[11:13])
 
 
 def _digest(paths: Iterable[Path]) -> str:
@@ -447,9 +567,11 @@ def _digest(paths: Iterable[Path]) -> str:
 class Trial:
     """A copy of the repository in a folder, in which one file at a time is changed."""
 
-    def __init__(self, folder: Path, patience_s: float) -> None:
+    def __init__(self, folder: Path) -> None:
         self.copy, self.folder = folder / "copy", folder
         self._time = int(time.time())
+        self.versions: dict[str, str] = {}
+        self.explained = equivalent()
         self._copy_repository()
         source = _digest(ROOT / name for name in self._files() if name.startswith("pbdkit/"))
         records = []
@@ -461,7 +583,8 @@ class Trial:
                 command = [sys.executable, str(Path(__file__)), "--record", name, str(target)]
                 subprocess.run(command, cwd=self.copy, env=self._environment(), check=True)
             records.append(target)
-        self.coverage = Coverage(records, patience_s)
+            self.versions[name] = key
+        self.coverage = Coverage(records)
 
     def _files(self) -> list[str]:
         options = ["--cached", "--others", "--exclude-standard"]
@@ -477,6 +600,7 @@ class Trial:
 
     def _environment(self) -> dict[str, str]:
         kernels = {"PBDKIT_CACHE_DIR": str(self.folder / "kernels"), "CI": "1"}
+        kernels["PYTEST_DISABLE_PLUGIN_AUTOLOAD"] = "1"
         paths = os.pathsep.join([str(self.copy), *filter(None, [os.environ.get("PYTHONPATH")])])
         return os.environ | kernels | {"PYTHONPATH": paths, "OMP_NUM_THREADS": "1"}
 
@@ -499,32 +623,105 @@ class Trial:
     def check(self) -> None:
         """Raise RuntimeError unless the cheapest tests pass without any change."""
         tests = sorted(self.coverage.cost, key=lambda name: self.coverage.cost[name])[:20]
-        if self._judged([tests]) != "survived":
+        if self._judged([dict.fromkeys(tests, 60.0)]) != "survived":
             raise RuntimeError(f"the tests fail without any change: {self.folder / 'log'}")
 
-    def result(self, mutant: Mutant) -> tuple[str, float]:
-        """Return the result of a mutant, and the processor time."""
-        path = self.copy / mutant.path
-        original = path.read_text()
-        begun = resource.getrusage(resource.RUSAGE_CHILDREN)
+    def results(
+        self, mutants: Sequence[Mutant], patience_s: float
+    ) -> Iterator[tuple[Mutant, str, float]]:
+        """Yield mutants with their results and the processor time, each in a new process, except
+        those that are explained."""
+        for mutant in mutants:
+            if mutant.change() in self.explained:
+                continue
+            begun = _children_s()
+            with self._changed(mutant):
+                verdict = self._judged(self._tests(mutant, patience_s))
+            yield mutant, verdict, _children_s() - begun
+
+    def replaced(
+        self, mutants: Sequence[Mutant], patience_s: float
+    ) -> Iterator[tuple[Mutant, str, float]]:
+        """Yield those mutants that can be had by replacing the code of functions, with their
+        results, which a process finds that has imported pbdkit and the tests."""
+        if not mutants:
+            return
+        source, target = os.pipe()
+        if pid := os.fork():
+            os.close(target)
+            with os.fdopen(source) as lines:
+                for line in lines:
+                    number, verdict, spent = json.loads(line)
+                    yield mutants[number], verdict, spent
+            if os.waitpid(pid, 0)[1]:
+                raise RuntimeError(f"a process of the trial ended early: {self.folder / 'log'}")
+            return
         try:
-            self._write(path, mutant.code())
-            verdict = self._judged(self.coverage.tests(mutant))
+            with os.fdopen(target, "w") as lines:
+                functions = self._import_tests()
+                for number, mutant in enumerate(mutants):
+                    if mutant.change() in self.explained:
+                        continue
+                    path, begun = self.copy / mutant.path, _children_s()
+                    old = path.read_text()
+                    with self._changed(mutant) as new:
+                        change = partial(replace_functions, functions, path, old, new)
+                        verdict = self._judged(self._tests(mutant, patience_s), change)
+                    if verdict != "unchanged":
+                        spent = _children_s() - begun
+                        print(json.dumps([number, verdict, spent]), file=lines, flush=True)
+        except BaseException:
+            traceback.print_exc()
+            os._exit(1)
+        os._exit(0)
+
+    def _import_tests(self) -> Functions:
+        """Import pbdkit and the tests, and return the functions."""
+        log = os.open(self.folder / "log-of-import", os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        streams = [os.dup(1), os.dup(2)]
+        for stream in (1, 2):
+            os.dup2(log, stream)
+        files = sorted({name.split("::")[0] for name in self.coverage.cost})
+        pytest.main([*OPTIONS, "--collect-only", *files])
+        for stream, kept in zip((1, 2), streams, strict=True):
+            os.dup2(kept, stream)
+        gc.collect()
+        gc.unfreeze()
+        functions = imported_functions(self.copy / "pbdkit")
+        gc.freeze()
+        return functions
+
+    @contextmanager
+    def _changed(self, mutant: Mutant) -> Iterator[str]:
+        """Write the changed file, and afterwards the original one."""
+        path = self.copy / mutant.path
+        original, changed = path.read_text(), mutant.code()
+        try:
+            self._write(path, changed)
+            yield changed
         finally:
             self._write(path, original)
-        ended = resource.getrusage(resource.RUSAGE_CHILDREN)
-        spent = ended.ru_utime + ended.ru_stime - begun.ru_utime - begun.ru_stime
-        return verdict, spent
 
-    def _judged(self, parts: Sequence[Sequence[str]]) -> str:
-        """Execute tests with kernels of their own."""
+    def digest(self, mutant: Mutant, patience_s: float) -> str:
+        """Return a digest of the tests of a mutant."""
+        parts = self.coverage.tests(mutant, patience_s)
+        names = [(name, self.versions[name.split("::")[0]]) for part in parts for name in part]
+        return hashlib.sha256(json.dumps(names).encode()).hexdigest()
+
+    def _tests(self, mutant: Mutant, patience_s: float) -> list[dict[str, float]]:
+        """Return tests of a mutant with their limits."""
+        extra = LIMIT_S + COMPILATION_S * (mutant.area in COMPILED)
+        parts = self.coverage.tests(mutant, patience_s)
+        return [{name: extra + 4 * self.coverage.cost[name] for name in part} for part in parts]
+
+    def _judged(self, parts: Sequence[dict[str, float]], change: Any = lambda: True) -> str:
+        """Execute tests with kernels of their own after a change in the process."""
         kernels, log = self.folder / "kernels-of-mutant", self.folder / "log"
         shutil.rmtree(kernels, ignore_errors=True)
         shutil.copytree(self.folder / "kernels", kernels, copy_function=os.link)
         os.environ["PBDKIT_CACHE_DIR"] = str(kernels)
         log.unlink(missing_ok=True)
-        limit = 30.0 + 4 * sum(self.coverage.cost[name] for part in parts for name in part)
-        return judged(lambda: execute(parts), limit, log)
+        return judged(lambda: execute(parts) if change() else UNCHANGED, log)
 
     def _write(self, path: Path, text: str) -> None:
         """Write a file with a time of its own, so that no older bytecode counts as valid."""
@@ -533,22 +730,66 @@ class Trial:
         os.utime(path, (self._time, self._time))
 
 
+def _children_s() -> float:
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def equivalent() -> dict[tuple[str, str, str], str]:
+    """Return the mutants that change no result, with the reason."""
+    entries = YAML(typ="safe").load(EQUIVALENT)
+    return {(entry["file"], entry["line"], entry["mutant"]): entry["reason"] for entry in entries}
+
+
 def report(results: dict[Mutant, str]) -> bool:
     """Print survivors and the table, and return whether the goal is met."""
-    for mutant in sorted(m for m, verdict in results.items() if verdict == "survived"):
-        print(f"survived: {mutant.name}")
+    explained = equivalent()
     counts: dict[str, Counter[str]] = defaultdict(Counter)
-    for mutant, verdict in results.items():
-        counts[mutant.area][verdict] += 1
-        counts["all"][verdict] += 1
-    print("area | mutants | killed | of these by timeout | survived")
+    for mutant, verdict in sorted(results.items()):
+        outcome = verdict
+        if verdict == "survived":
+            file, line, changed = mutant.change()
+            outcome = "explained" if (file, line, changed) in explained else "survived"
+            print(f"{outcome}: {mutant.name}\n    - {line}\n    + {changed}")
+        counts[mutant.area][outcome] += 1
+        counts["all"][outcome] += 1
+    print("area | mutants | killed | of these by time limit | survived, explained | unexplained")
     for area in [*(a for a in AREAS if a in counts), "all"]:
-        number = counts[area]
-        killed = number["killed"] + number["timeout"]
-        print(f"{area} | {number.total()} | {killed} | {number['timeout']} | {number['survived']}")
-    share = 1 - counts["all"]["survived"] / max(1, counts["all"].total())
-    print(f"killed: {share:.1%}; goal {GOAL:.0%}")
-    return share >= GOAL
+        n = counts[area]
+        killed = n["killed"] + n["timeout"]
+        print(
+            f"{area} | {n.total()} | {killed} | {n['timeout']} | {n['explained']} | {n['survived']}"
+        )
+    share = (n["killed"] + n["timeout"]) / max(1, n.total())
+    print(f"killed: {share:.1%}, goal {GOAL:.0%}; unexplained survivors: {n['survived']}, goal 0")
+    return share >= GOAL and not n["survived"]
+
+
+class Results:
+    """The results of mutants in a file. A survivor is tried again if it has other tests."""
+
+    def __init__(self, path: Path, trial: Trial) -> None:
+        self.path, self.trial = path, trial
+        self.kept = json.loads(path.read_text()) if path.exists() else {}
+
+    def _key(self, mutant: Mutant) -> str:
+        return f"{mutant.name} {_digest([ROOT / mutant.path])}"
+
+    def get(self, mutant: Mutant) -> str | None:
+        """Return the result of a mutant."""
+        verdict, _ = self.kept.get(self._key(mutant), (None, ""))
+        return str(verdict) if verdict else None
+
+    def is_open(self, mutant: Mutant, patience_s: float) -> bool:
+        """Return whether the mutant has no result or survived other tests."""
+        verdict, tests = self.kept.get(self._key(mutant), (None, ""))
+        known = verdict in ("killed", "timeout")
+        return not known and tests != self.trial.digest(mutant, patience_s)
+
+    def keep(self, mutant: Mutant, verdict: str, patience_s: float) -> None:
+        """Write the result of a mutant."""
+        self.kept[self._key(mutant)] = verdict, self.trial.digest(mutant, patience_s)
+        self.path.write_text(json.dumps(self.kept, indent=0))
 
 
 def main() -> int:
@@ -558,36 +799,30 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--area", choices=[*AREAS], action="append", help="default: all")
     parser.add_argument("--folder", type=Path, default=ROOT / "build" / "mutants")
-    parser.add_argument("--patience", type=float, default=30.0, help="seconds of tests per mutant")
-    parser.add_argument("--again", action="store_true", help="only earlier survivors")
+    parser.add_argument("--first", type=float, default=5.0, help="seconds of tests per mutant")
+    parser.add_argument("--patience", type=float, default=60.0, help="the same for survivors")
     parser.add_argument("--show", action="store_true", help="print the mutants, execute nothing")
     parser.add_argument("--record", nargs=2, metavar=("FILE", "TARGET"), help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.record:
         record(options.record[0], Path(options.record[1]))
         return 0
-    options.folder.mkdir(parents=True, exist_ok=True)
     mutants = drawn(options.count, options.seed, options.area or [*AREAS])
-    kept = options.folder / "results.json"
-    earlier = json.loads(kept.read_text()) if kept.exists() else {}
     if options.show:
-        for mutant in mutants:
-            print(mutant.name)
+        print(*(mutant.name for mutant in mutants), sep="\n")
         return 0
-    trial = Trial(options.folder.resolve(), options.patience)
+    options.folder.mkdir(parents=True, exist_ok=True)
+    trial = Trial(options.folder.resolve())
+    results = Results(options.folder / "results.json", trial)
     trial.prepare()
     trial.check()
-    results = {}
-    for mutant in mutants:
-        key = hashlib.sha256(mutant.code().encode()).hexdigest()
-        verdict = earlier.get(key)
-        if verdict is None or (options.again and verdict == "survived"):
-            verdict, spent = trial.result(mutant)
+    for patience_s, way in ((options.first, trial.replaced), (options.patience, trial.results)):
+        pending = [mutant for mutant in mutants if results.is_open(mutant, patience_s)]
+        for mutant, verdict, spent in way(pending, patience_s):
             print(f"{mutant.area} | {mutant.name} | {verdict} | {spent:.1f} s", flush=True)
-            earlier[key] = verdict
-            kept.write_text(json.dumps(earlier, indent=0))
-        results[mutant] = verdict
-    return 0 if report(results) else 1
+            results.keep(mutant, verdict, patience_s)
+    verdicts = ((mutant, results.get(mutant) or "survived") for mutant in mutants)
+    return 0 if report(dict(verdicts)) else 1
 
 
 if __name__ == "__main__":

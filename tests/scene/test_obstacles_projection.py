@@ -150,3 +150,33 @@ def test_vertices_of_polygons_are_distinct_and_counterclockwise() -> None:
         assert sorted(map(tuple, points)) == sorted(map(tuple, square))
         x, y = points.T
         assert (x * np.roll(y, -1) - np.roll(x, -1) * y).sum() == 8.0
+
+
+def test_the_order_of_outlines_does_not_matter() -> None:
+    names = [*SHAPES]
+    walls = Walls.of([outline(name) for name in names])
+    others = Walls.of([outline(name) for name in names[::-1]])
+    with np.errstate(all="ignore"):
+        for at in places(8).T:
+            w = contact_correction(*at, 1.2, 0.45, 0.8, 0, *walls)
+            np.testing.assert_allclose(
+                contact_correction(*at, 1.2, 0.45, 0.8, 0, *others), w, atol=1e-12
+            )
+
+
+@pytest.mark.parametrize("size", [1e3, 1e6, 1e8])
+@pytest.mark.parametrize("angle", [0.0, 0.3, 2.0])
+def test_corrections_by_large_outlines_leave_no_depth(size: float, angle: float) -> None:
+    """The tolerance of a depth follows the rounding errors of the points of an outline."""
+    c, s = np.cos(angle), np.sin(angle)
+    square = np.array([[-0.7, 0.0], [0.9, 0.0], [0.9, -1.1], [-0.7, -1.1]]) * size
+    vertices = square @ [[c, s], [-s, c]]
+    big = outline_of(Obstacle(shape={"type": "polygon", "vertices": vertices.tolist()}).shape)
+    walls, at = Walls.of([big]), places(100)
+    inside = big.facing(*at)[0] < 0.0
+    assert 10 < inside.sum() < 90
+    C = np.repeat([[1.0], [0.0], [1.0]], 100, axis=1)
+    moved = at + np.where(inside, big.outline_correction(at, C), 0.0)
+    assert all(walls.clearance(x, y) == 0.0 for x, y in moved.T)
+    normal = np.array([-s, c])
+    np.testing.assert_allclose((normal @ moved)[inside], 0.0, atol=1e-14 * size)
