@@ -144,7 +144,7 @@ LONGEST_TEST_S = 8.0
 LIMIT_S = 5.0
 """Processor time after which a test is ended, in addition to four times what it needs."""
 COMPILATION_S = 25.0
-"""The same for areas with code that is compiled."""
+"""Additional processor time for areas with code that is compiled."""
 COMPILED = ("evaluator", "engines")
 LONGEST_SLEEP_S = 100.0
 """Time after which a process that uses no processor is ended."""
