@@ -319,9 +319,9 @@ class SweepMachine(Counted):
     """Sweeps with changing members and variables into one folder. No member has the values of
     another one, and none is run again once it has been committed."""
 
-    @initialize(netcdf=st.integers(0, 19))
+    @initialize(netcdf=st.integers(0, 59))
     def begin(self, netcdf: int) -> None:
-        if netcdf < 19:
+        if netcdf < 59:
             self.patch.setattr("pbdkit.sweeps.execute.write_dataset", write_pickle)
         self.now = 0.0
         self.sure: set[str] = set()
