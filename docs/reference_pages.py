@@ -10,6 +10,7 @@ import inspect
 import json
 import re
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -77,21 +78,26 @@ class Claims(SphinxDirective):
 
 
 def claim_rows(claims: list[dict[str, Any]], records: list[dict[str, Any]]) -> Iterator[str]:
-    """Yield the Markdown of the claims, each with its last record, and of the machines."""
-    latest = {record["claim"]: record for record in records}
+    """Yield the Markdown of the claims, each with the records of its last day, and of the
+    machines."""
+    latest: dict[str, list[dict[str, Any]]] = {}
+    for record in records:
+        same_day = [r for r in latest.get(record["claim"], []) if r["date"] == record["date"]]
+        latest[record["claim"]] = [*same_day, record]
     yield "| claim | in every change, `tests/` | trial | every | last figures |\n| " + "--- | " * 5
     for claim in claims:
         nights = claim.get("nights", 1)
         tests = ", ".join(f"`{name}`" for name in claim["suite"])
         row = [claim["claim"], tests, f"`{cell(claim['trial'])}`"]
         row += ["night" if nights == 1 else f"{nights} nights"]
-        yield "| " + " | ".join([*row, last_figures(latest.get(claim["claim"]))]) + " |"
+        figures = map(last_figures, latest.get(claim["claim"], [None]))
+        yield "| " + " | ".join([*row, "; ".join(figures)]) + " |"
     yield "\nThe machines of these figures:\n"
-    yield from sorted({f"- {machine_text(record)}" for record in latest.values()})
+    yield from sorted({f"- {machine_text(record)}" for record in chain(*latest.values())})
 
 
 def last_figures(record: dict[str, Any] | None) -> str:
-    """Return the cell of the last run of a trial."""
+    """Return the text of one run of a trial."""
     if record is None:
         return "not run yet"
     outcome = "" if record["exit"] == 0 else f"**failed** (status {record['exit']}); "

@@ -54,3 +54,19 @@ def test_the_nightly_fails_with_a_trial(monkeypatch, tmp_path, trial, status):
     assert nightly.main() == (status > 0)
     (record,) = map(json.loads, figures.read_text().splitlines())
     assert record["exit"] == status
+
+
+def test_the_page_has_all_figures_of_the_last_day_of_a_trial(monkeypatch):
+    pytest.importorskip("sphinx")
+    monkeypatch.syspath_prepend(Path(__file__).parents[1] / "docs")
+    from reference_pages import claim_rows
+
+    machine = {"processor": "P", "processors": 2, "system": "S", "python": "3", "numpy": "2"}
+    record = {"claim": "c", "commit": "1a", "exit": 0, "seconds": 5, "machine": machine}
+    record["machine"]["numba"] = "0"
+    parts = [("2026-01-01", "old"), ("2026-01-02", "one | 7"), ("2026-01-02", "two | 8")]
+    records = [record | {"date": day, "figures": [text]} for day, text in parts]
+    page = list(claim_rows([{"claim": "c", "suite": [], "trial": "t"}], records))
+    assert "2026-01-02, `1a`, 5 s: one \\| 7; 2026-01-02, `1a`, 5 s: two \\| 8" in page[1]
+    assert "old" not in page[1]
+    assert page[-1].startswith("- P, 2 processors")
