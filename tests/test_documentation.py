@@ -1,6 +1,9 @@
 """Commands and code blocks of the documentation run."""
 
+import contextlib
+import io
 import re
+import runpy
 import shlex
 import signal
 import subprocess
@@ -38,6 +41,8 @@ def blocks(language):
             continue
         experiments = tuple(blocks_in(page, "yaml"))
         for n, code in enumerate(blocks_in(page, language)):
+            if script_of(code):  # by `test_commands_work_in_their_order`
+                continue
             param = pytest.param(page, code, id=f"{page.name}-{n}")
             found.setdefault((code, experiments), param)
     return [*found.values()]
@@ -45,6 +50,12 @@ def blocks(language):
 
 def blocks_in(page, language):
     return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(), re.M | re.S)
+
+
+def script_of(code):
+    """Return the name of the file in the first line of a block, which commands of its page run."""
+    names = re.findall(r"\A# (\w+\.py)$", code, re.M)
+    return names[0] if names else None
 
 
 COARSER = {
@@ -83,7 +94,10 @@ def name_of(page, code):
 
 
 def save_experiments(page):
-    """Save the page's own experiments and sweeps in the current folder."""
+    """Save the page's own experiments, sweeps and scripts in the current folder."""
+    for code in blocks_in(page, "python"):
+        if name := script_of(code):
+            Path(name).write_text(code)
     for code in blocks_in(page, "yaml"):
         Path(f"{name_of(page, code)}.yaml").write_text(code)
 
@@ -151,19 +165,52 @@ def test_commands_work_in_their_order(page, code, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     save_experiments(page)
     install(page)
-    for line in code.replace("\\\n", "").splitlines():
-        if not line.startswith("$ pbdkit "):
+    for command, *shown in calls_in(code):
+        if command.startswith("pbdkit live "):
+            assert_served_until_interrupted(command)
             continue
-        if line.startswith("$ pbdkit live "):
-            assert_served_until_interrupted(line.removeprefix("$ "))
+        program_name, *words = shlex.split(command)
+        if program_name == "python":
+            printed = io.StringIO()
+            with contextlib.redirect_stdout(printed):
+                runpy.run_path(*words, run_name="__main__")
+            assert_shown(shown, printed.getvalue())
             continue
-        words = shlex.split(line.removeprefix("$ pbdkit "))
-        for beginning, options in FEWER.items():
-            words += options * (words[: len(beginning.split())] == beginning.split())
-        result = CliRunner().invoke(program, words)
-        assert result.exit_code == 0, (line, result.output, result.exception)
+        changed = [o for n, o in FEWER.items() if words[: len(n.split())] == n.split()]
+        result = CliRunner().invoke(program, words + sum(changed, []))
+        assert result.exit_code == 0, (command, result.output, result.exception)
+        if not changed:
+            assert_shown(shown, result.output)
     for movie in tmp_path.glob("*.gif"):
         assert_same_movie(ROOT / "docs" / "pictures" / movie.name, movie)
+
+
+def calls_in(code):
+    """Return the commands of a block, each with the lines of its output that the block shows."""
+    calls = []
+    for line in code.replace("\\\n", "").splitlines():
+        if line.startswith(("$ pbdkit ", "$ python ")):
+            calls.append([line.removeprefix("$ ")])
+        elif calls:
+            calls[-1].append(line)
+    return calls
+
+
+TIMES = re.compile(r"\b[\d.]+ (?:ms|s|min)\b")
+
+
+def assert_shown(shown, output):
+    """Assert that the output contains the lines in their order, up to durations and `...`."""
+    printed = iter([*map(plain, output.splitlines()), None])
+    for line in filter(None, map(plain, shown)):
+        pattern = re.escape(line).replace(re.escape("..."), ".*")
+        assert any(text is not None and re.fullmatch(pattern, text) for text in printed), (
+            f"not printed: {line}\n{output}"
+        )
+
+
+def plain(line):
+    return TIMES.sub("T", " ".join(line.split()))
 
 
 def assert_same_movie(shown, made):
