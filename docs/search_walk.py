@@ -73,6 +73,15 @@ EXPECTED = {
     "user subroutine": "finite-elements",
     "UMAT": "finite-elements",
     "ParaView": "paraview",
+    "dogbone": "tensile-test",
+    "load-displacement curve": "tensile-test",
+    "Kirsch": "plate-with-hole",
+    "effective modulus": "effective-modulus",
+    "composite bounds": "effective-modulus",
+    "own rule": "extending/tutorial",
+    "installable package": "extending/tutorial",
+    "angle term": "extending/tutorial",
+    "parameter map": "parameter-sweep",
 }
 """Terms, and the pages of which one must be listed first."""
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
