@@ -3,6 +3,7 @@ const OFFSETS = [
   ["finite-elements", 3],
   ["glossary", -3],
   ["keys", -3],
+  ["extending/tutorial", 3],
   ["extending", -4],
   ["validation/reproduction", -11],
   ["validation", -10],

@@ -104,7 +104,8 @@ def save_experiments(page):
 
 def install(page):
     """Run the experiments of the installation on the page: its other blocks use their results."""
-    for name in re.findall(r"&& \.venv/bin/pbdkit run (\S+)$", page.read_text(), re.M):
+    runs = re.findall(r"&& \.venv/bin/pbdkit run (\S+)$", page.read_text(), re.M)
+    for name in dict.fromkeys(runs):
         assert CliRunner().invoke(program, ["run", name]).exit_code == 0
 
 
@@ -176,8 +177,9 @@ def test_commands_work_in_their_order(page, code, tmp_path, monkeypatch):
                 runpy.run_path(*words, run_name="__main__")
             assert_shown(shown, printed.getvalue())
             continue
-        changed = [o for n, o in FEWER.items() if words[: len(n.split())] == n.split()]
-        result = CliRunner().invoke(program, words + sum(changed, []))
+        fewer = [o for n, o in FEWER.items() if words[: len(n.split())] == n.split()]
+        changed = [option for options in fewer for option in options]
+        result = CliRunner().invoke(program, words + changed)
         assert result.exit_code == 0, (command, result.output, result.exception)
         if not changed:
             assert_shown(shown, result.output)
@@ -320,6 +322,8 @@ ELSEWHERE = {
     "pbdkit run pbdkit-mine/example.yaml": "`cli/test_plugins_new`",
     "pbdkit plugins check pbdkit-lazy": "`plugin/test_documentation`",
     "pbdkit run paper/a --set 'rule={type: lazy}'": "`plugin/test_documentation`",
+    "pbdkit run paper/a --set 'rule={type: lazy-angles": "`plugin/test_documentation`",
+    "pbdkit plot angles.nc": "`plugin/test_documentation`",
     "pbdkit run experiments/": "the tests of the plugins",
     "pbdkit plot kagome-tensile.nc": "the tests of the plugins",
     "pbdkit explain weibull-sheet.nc": "the tests of the plugins",

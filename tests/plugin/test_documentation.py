@@ -209,9 +209,9 @@ def test_the_tutorial_leads_from_a_notebook_to_a_tested_plugin(
     assert names["ds"].attrs["status"] == "complete"
 
     files = dict(re.findall(r"^`(\S+)`:\n\n```\w+\n(.*?)^```", text, re.M | re.S))
-    assert set(files) == {"pyproject.toml", "pbdkit_lazy.py", "test_lazy.py"}
-    install("pbdkit-lazy", files["pbdkit_lazy.py"], version="0.1.0")
-    (tmp_path / "test_lazy.py").write_text(files["test_lazy.py"])
+    assert set(files) == {"pbdkit-lazy/pbdkit_lazy.py", "pbdkit-lazy/tests/test_conformance.py"}
+    install("pbdkit-lazy", files["pbdkit-lazy/pbdkit_lazy.py"], version="0.1.0")
+    (tmp_path / "test_lazy.py").write_text(files["pbdkit-lazy/tests/test_conformance.py"])
     pytest_call = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_lazy.py"]
     places = [str(Path(pbdkit.__file__).parent.parent), os.environ["PYTHONPATH"]]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(places)}
@@ -219,10 +219,12 @@ def test_the_tutorial_leads_from_a_notebook_to_a_tested_plugin(
         pytest_call, cwd=tmp_path, capture_output=True, text=True, env=environment
     )
     assert done.returncode == 0, done.stdout
-    assert "FollowerRule lazy: 21 properties ran, 0 failed" in done.stdout
+    for name in ("lazy", "lazy-angles"):
+        assert f"FollowerRule {name}: 22 properties ran, 0 failed" in done.stdout
 
-    commands = re.findall(r"^pbdkit (.*)$", text, re.M)
-    assert len(commands) == 2
+    created, *commands = re.findall(r"^pbdkit (.*)$", text, re.M)
+    assert created == "plugins new pbdkit-lazy"  # by `cli/test_plugins_new`
+    assert len(commands) == 4
     for command in commands:
         result = call(*shlex.split(command))
         assert result.code == 0, result.err
