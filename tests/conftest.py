@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import importlib
 import json
 import os
 import signal
@@ -114,6 +115,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
     site = tmp_path / "site"
     site.mkdir()
     monkeypatch.setenv("PYTHONPATH", str(site), prepend=os.pathsep)
+    monkeypatch.syspath_prepend(site)
     modules = []
 
     def make(distribution: str, source: str, version: str = "1.0", group: str = "pbdkit") -> None:
@@ -125,7 +127,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
         metadata = f"Metadata-Version: 2.1\nName: {distribution}\nVersion: {version}\n"
         (info / "METADATA").write_text(metadata)
         (info / "entry_points.txt").write_text(f"[{group}]\n{distribution} = {module}\n")
-        monkeypatch.syspath_prepend(site)
+        importlib.invalidate_caches()
 
     yield make
     for module in modules:

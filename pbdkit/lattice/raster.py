@@ -70,7 +70,17 @@ class Block:
 
     def slices(self) -> tuple[Any, ...]:
         """Return the index of the block in an array (sublattice, cell, cell)."""
-        return (self.sublattice, *map(slice, self.start, self.stop))
+        return self._index[1:]
+
+    @cached_property
+    def _index(self) -> tuple[Any, ...]:
+        """Index of the block in an array of shape (..., sublattice, cell, cell)."""
+        return (..., self.sublattice, *map(slice, self.start, self.stop))
+
+    @cached_property
+    def _index_within(self) -> tuple[Any, ...]:
+        """Index of the block in an array of shape (..., cell, cell)."""
+        return (..., *map(slice, self.start, self.stop))
 
     def seen_through(self, slot: Slot | Offset) -> Block:
         """Return the block that contains, for each particle of this block, its neighbour along a
@@ -81,11 +91,13 @@ class Block:
     def of(self, values: NDArray[Any]) -> NDArray[Any]:
         """Return a view of the values on the block, given an array of shape (..., sublattice, cell,
         cell)."""
-        return values[(..., *self.slices())]
+        view: NDArray[Any] = values[self._index]
+        return view
 
     def within(self, values: NDArray[Any]) -> NDArray[Any]:
         """Return a view of the values on the block, given an array of shape (..., cell, cell)."""
-        return values[(..., *self.slices()[1:])]
+        view: NDArray[Any] = values[self._index_within]
+        return view
 
     def rows(self, cells: int) -> list[Block]:
         """Divide the block along its first axis into parts of about `cells` cells."""

@@ -7,8 +7,8 @@ functions use + - * /, the functions of numpy, and `where` in place of condition
 from __future__ import annotations
 
 from collections import namedtuple
-from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING, Any, Self, TypeAlias, cast, overload
+from collections.abc import Callable, Iterable, Iterator
+from typing import TYPE_CHECKING, Any, Self, TypeAlias, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,28 +83,35 @@ class Vector(_Plane[T]):
         >>> Vector(1.0, -2.0).each(abs)
         Vector(x=1.0, y=2.0)
         """
-        return self._of([function(*parts) for parts in zip(self, *vectors, strict=True)])
+        values = [function(*parts) for parts in zip(self, *vectors, strict=True)]
+        return tuple.__new__(type(self), values)
 
-    def _of(self, components: list[Any]) -> Self:
-        return tuple.__new__(type(self), components)
+    # The operators call no further Python function, because steps on small lattices consist mainly
+    # of calls.
 
     def __add__(self, other: Vector[Any]) -> Self:  # type: ignore[override]  # adds, as arrays do
-        return self._of([a + b for a, b in zip(cast(Any, self), other, strict=True)])
+        pairs: Iterator[Any] = zip(self, other, strict=True)
+        return tuple.__new__(type(self), [a + b for a, b in pairs])
 
     def __sub__(self, other: Vector[Any]) -> Self:
-        return self._of([a - b for a, b in zip(cast(Any, self), other, strict=True)])
+        pairs: Iterator[Any] = zip(self, other, strict=True)
+        return tuple.__new__(type(self), [a - b for a, b in pairs])
 
     def __neg__(self) -> Self:
-        return self._of([-component for component in cast(Any, self)])
+        components: tuple[Any, ...] = self
+        return tuple.__new__(type(self), [-component for component in components])
 
     def __mul__(self, factor: Number) -> Self:  # type: ignore[override]  # scales, as arrays do
-        return self._of([component * factor for component in cast(Any, self)])
+        components: tuple[Any, ...] = self
+        return tuple.__new__(type(self), [component * factor for component in components])
 
     def __rmul__(self, factor: Number) -> Self:  # type: ignore[override]  # scales, as arrays do
-        return self._of([factor * component for component in cast(Any, self)])
+        components: tuple[Any, ...] = self
+        return tuple.__new__(type(self), [factor * component for component in components])
 
     def __truediv__(self, divisor: Number) -> Self:
-        return self._of([component / divisor for component in cast(Any, self)])
+        components: tuple[Any, ...] = self
+        return tuple.__new__(type(self), [component / divisor for component in components])
 
 
 class SpaceVector(_Space[T], Vector[T]):
@@ -134,7 +141,7 @@ def vector(components: Iterable[Any]) -> Any:
     values = tuple(components)
     if len(values) not in KINDS:
         raise ValueError(f"a vector has two or three components, not {len(values)}")
-    return KINDS[len(values)](*values)
+    return tuple.__new__(KINDS[len(values)], values)
 
 
 @overload
@@ -165,7 +172,11 @@ def where(condition: Any, yes: Any, no: Any) -> Any:
     Vector(x=0.0, y=1.0)
     """
     if isinstance(yes, Vector):
-        return yes._of([np.where(condition, *parts) for parts in zip(yes, no, strict=True)])
+        values = [where(condition, *parts) for parts in zip(yes, no, strict=True)]
+        return tuple.__new__(type(yes), values)
+    if isinstance(condition, (bool, np.bool_)) and isinstance(yes, float) and isinstance(no, float):
+        # For single numbers `numpy.where` takes several times as long.
+        return np.float64(yes if condition else no)
     return np.where(condition, yes, no)
 
 
@@ -187,9 +198,8 @@ def dot(a: Vector[T], b: Vector[T]) -> T:
     >>> dot(Vector(1.0, 2.0), Vector(3.0, 4.0))
     11.0
     """
-    products: list[Any] = [
-        component * factor for component, factor in zip(a, cast(Any, b), strict=True)
-    ]
+    pairs: Iterator[Any] = zip(a, b, strict=True)
+    products = [component * factor for component, factor in pairs]
     # No type is named here, because the kernel cache identifies functions by the objects to which
     # they refer.
     total: T = sum(products[1:], products[0])

@@ -54,7 +54,8 @@ class Fracturing:
             block = plane_block(scene.raster, plane, inside=inside)
             for part in block.rows(BLOCK_CELLS) if block else ():
                 where_ = bonds_in(scene.raster, part, plane, frame_too)
-                self._breakable.append((n, plane.slot, part, where_))
+                target = part.seen_through(plane.slot)
+                self._breakable.append((n, plane.slot, part, target, where_))
 
     def break_bonds(
         self, m: NDArray[Any], state: State, step: int, *, in_turn: bool = False
@@ -104,9 +105,8 @@ class Fracturing:
         updated in place, or in copies if the relative displacements of the ends of all bonds are
         changed by a `nudge`."""
         assert state.broken_step is not None
-        for n, slot, block, breakable in self._breakable:
-            target, source = block.seen_through(slot).of(m), block.of(m)
-            d, r = vector(target) - vector(source), slot.rest
+        for n, slot, block, target, breakable in self._breakable:
+            d, r = vector(target.of(m) - block.of(m)), slot.rest
             intact = breakable & (block.within(state.broken_step[n]) < 0)
             numbers = [block.within(value[n]) for value in state.bond_values]
             if nudge:

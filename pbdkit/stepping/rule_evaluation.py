@@ -81,6 +81,8 @@ class Evaluator:
         self._scene = scene
         self.rule: FollowerRule = scene.experiment.rule
         self._model = scene.experiment.fracture
+        self._softens = isinstance(self._model, Softens)
+        self._uses_angles = isinstance(self.rule, UsesAngles)
         self._p, self._q = scene.constants.rule, scene.constants.fracture
         self.tears = scene.tears
         self._of_bond = bond_numbers(scene.experiment)
@@ -116,6 +118,8 @@ class Evaluator:
         all pairs of neighbours."""
         along = list(zip(d, neighbours, strict=True))
         total = summed((self.contribution(one, u, to), to.present) for one, to in along)
+        if not self._uses_angles:
+            return total
         return total + summed(self.pair_contributions(d, u, neighbours))
 
     def pair_contributions(
@@ -149,12 +153,12 @@ class Evaluator:
         """Return the difference that the rule receives instead of d. At a broken bond it is the
         difference to the fictitious point, and at a softened bond a combination of both
         differences."""
-        model = self._model
+        model: Any = self._model
         if to.broken is None and to.c is None:
             return d
         with errors_attributed_to(model, "to place a fictitious point"):
             lost = as_vector(model.fictitious(u, to.r, self._q), "fictitious", u)
-        if isinstance(model, Softens) and to.c is not None:
+        if self._softens and to.c is not None:
             with errors_attributed_to(model, "to soften a bond"):
                 d = as_vector(model.seen(d, lost, to.r, to.c, self._q), "seen", u)
         return d if to.broken is None else where(to.broken, lost, d)
@@ -258,9 +262,12 @@ def summed(parts: Iterable[tuple[Contributions, Mask | None]]) -> Contributions:
     total: Contributions | None = None
     for part, present in parts:
         if present is not None:
-            part = tuple(_masked(value, present) for value in part)
-        refuse_other_count(part, part if total is None else total)
-        total = part if total is None else tuple(a + b for a, b in zip(total, part, strict=True))
+            part = tuple([_masked(value, present) for value in part])
+        if total is None:
+            total = part
+            continue
+        refuse_other_count(part, total)
+        total = tuple([a + b for a, b in zip(total, part, strict=True)])
     return total or ()
 
 
@@ -283,7 +290,7 @@ def _both(one: Mask | None, other: Mask | None) -> Mask | None:
 
 def _masked(value: Any, present: Mask) -> Any:
     if isinstance(value, Vector):
-        return value.each(lambda component: np.where(present, component, 0.0))
+        return vector([np.where(present, component, 0.0) for component in value])
     return np.where(present, value, 0.0)
 
 
@@ -303,6 +310,7 @@ class Surroundings:
     def __init__(self, scene: Scene, where: Where, sublattice: int) -> None:
         self._scene, self.where, self._sublattice = scene, where, sublattice
         self._evaluator = Evaluator(scene)
+        self._softens = isinstance(scene.experiment.fracture, (Softens, SoftensCells))
         self.slots = scene.neighbourhood.slots[sublattice]
         self._present = presence(scene.raster, where, self.slots)
         self._weights = [scene.constants.weights[slot] for slot in self.slots]
@@ -336,8 +344,8 @@ class Surroundings:
 
     def differences(self, u: NDArray[Any]) -> list[Vector]:
         """Return u_k - u_j along each slot."""
-        center = vector(self.where.of(u))
-        return [vector(target.of(u)) - center for target in self._there]
+        center = self.where.of(u)
+        return [vector(target.of(u) - center) for target in self._there]
 
     def neighbours(self, state: State) -> list[Neighbour]:
         """Return the neighbours along each slot in a state."""
@@ -355,12 +363,12 @@ class Surroundings:
                 slot.rest,
                 w,
                 present,
-                *self._bond(slot, state),
+                *self._bond(slot, *bonds, state),
                 extra,
                 self._shared(slot, state),
                 sublattice=self._sublattice,
             )
-            for slot, w, present, extra in parts
+            for (slot, w, present, extra), bonds in zip(parts, self._bonds, strict=True)
         ]
 
     @property
@@ -420,13 +428,14 @@ class Surroundings:
 
     def _torn(self, state: State) -> dict[Slot, Torn] | None:
         """Return the damage beside each slot; None if nothing is damaged."""
-        softens = isinstance(self._scene.experiment.fracture, (Softens, SoftensCells))
         assert state.broken_step is not None
-        if not softens and state.broken_step.max(initial=-1) < 0:
+        if not self._softens and state.broken_step.max(initial=-1) < 0:
             return None
         around = self._scene.neighbourhood.cells_around[self._sublattice]
-        bonds = {(bond.plane, bond.owner): bond for cell in around.cells for bond in cell}
-        damage = {key: self._damage(bond, state) for key, bond in bonds.items()}
+        damage = {
+            key: self._damage(bond, owner, state)
+            for key, (bond, owner) in self._bonds_of_cells.items()
+        }
         if not any(np.any(values) for both in damage.values() for values in both):
             return None
         largest = [
@@ -443,37 +452,56 @@ class Surroundings:
             )
         return torn
 
-    def _damage(self, bond: CellBond, state: State) -> tuple[NDArray[np.floating[Any]], ...]:
+    @cached_property
+    def _bonds_of_cells(self) -> dict[tuple[int, Slot | None], tuple[CellBond, Where]]:
+        """Bonds of the cells around the particles, with their places, by plane and owner."""
+        cells = self._scene.neighbourhood.cells_around[self._sublattice].cells
+        return {
+            (bond.plane, bond.owner): (
+                bond,
+                self.where.seen_through(bond.owner) if bond.owner else self.where,
+            )
+            for cell in cells
+            for bond in cell
+        }
+
+    def _damage(
+        self, bond: CellBond, owner: Where, state: State
+    ) -> tuple[NDArray[np.floating[Any]], ...]:
         """Return the lost fractions of the forces of bonds, one array for the cells to the left of
         the bonds and one for the cells to their right. The fractions are 1 for broken bonds."""
-        scene, owner = self._scene, self.where
-        if bond.owner:
-            owner = owner.seen_through(bond.owner)
         assert state.broken_step is not None
         broken = owner.within(state.broken_step[bond.plane]) >= 0
-        softened: tuple[Any, Any] = 0.0, 0.0
-        if isinstance(scene.experiment.fracture, (Softens, SoftensCells)):
-            numbers = shown([owner.within(value[bond.plane]) for value in state.bond_values])
-            limits = scene.constants.limits_at(bond.slot, bond.plane, owner)
-            softened = self._evaluator.damage(
-                bond.slot.rest, scene.constants.of_bond(*limits, *numbers)
-            )
-        precision = scene.experiment.stepping.precision
+        precision = self._scene.experiment.stepping.precision
+        if not self._softens:
+            lost = broken.astype(precision)
+            return lost, lost
+        constants = self._scene.constants
+        numbers = shown([owner.within(value[bond.plane]) for value in state.bond_values])
+        limits = constants.limits_at(bond.slot, bond.plane, owner)
+        softened = self._evaluator.damage(bond.slot.rest, constants.of_bond(*limits, *numbers))
         return tuple(np.where(broken, 1.0, side).astype(precision) for side in softened)
 
-    def _bond(self, slot: Slot, state: State) -> tuple[Mask | None, Any]:
+    @cached_property
+    def _bonds(self) -> list[tuple[int, Where]]:
+        """For each slot the plane of its bonds, and the places of the bonds in this plane."""
+        owners = map(self._scene.neighbourhood.owner.__getitem__, self.slots)
+        ends = zip(owners, self._there, strict=True)
+        return [
+            (plane, self.where if at_this_end else there) for (plane, at_this_end), there in ends
+        ]
+
+    def _bond(self, slot: Slot, plane: int, owner: Where, state: State) -> tuple[Mask | None, Any]:
         """Return a mask of the broken bonds along a slot, and the constants of the bonds if the
         fracture model receives them."""
         if state.broken_step is None:
             return None, None
-        scene = self._scene
-        plane, at_this_end = scene.neighbourhood.owner[slot]
-        owner = self.where if at_this_end else self.where.seen_through(slot)
         broken = owner.within(state.broken_step[plane]) >= 0
         c = None
-        if isinstance(scene.experiment.fracture, Softens):
+        if self._softens:
+            constants = self._scene.constants
             numbers = shown([owner.within(value[plane]) for value in state.bond_values])
-            c = scene.constants.of_bond(*scene.constants.limits_at(slot, plane, owner), *numbers)
+            c = constants.of_bond(*constants.limits_at(slot, plane, owner), *numbers)
         return (broken if broken.any() else None), c
 
 

@@ -130,9 +130,9 @@ def test_damage_is_computed_once_for_each_bond_and_only_in_damaged_bodies(monkey
     scene = build_scene(pbdkit.Experiment(**CRACKED | parts))
     state, computed, damage_of = initial_state(scene), [], Surroundings._damage
 
-    def damage(self, bond, state):
+    def damage(self, bond, owner, state):
         computed.append((bond.plane, bond.owner))
-        return damage_of(self, bond, state)
+        return damage_of(self, bond, owner, state)
 
     monkeypatch.setattr(Surroundings, "_damage", damage)
     (surroundings,) = blocks(scene)

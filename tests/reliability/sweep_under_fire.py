@@ -29,7 +29,6 @@ SHEET = {
     "rule": {"type": "barycentre"},
     "initial": {"type": "noise", "amplitude": 0.1},
     "leaders": [{"select": {"edge": "left"}, "motion": {"type": "hold"}}],
-    "steps": 1000,
 }
 KEEP = {"variables": ["position"], "times": "last"}
 WORKERS, PATIENCE_S = 4, 0.01
@@ -61,10 +60,13 @@ def held(folder: Path) -> int:
         return 0
 
 
-def under_fire(folder: Path, members: int, kills: int, workers: int) -> dict[str, Any]:
+def under_fire(
+    folder: Path, members: int, kills: int, workers: int, steps: int = 1000
+) -> dict[str, Any]:
     """Sweeps twice, disturbed and not; what came of it."""
     chance, vary = random.Random(0), {"seed": list(range(members))}
-    sweep = {"version": 1, "experiment": SHEET, "vary": vary, "keep": KEEP}
+    sheet = SHEET | {"steps": steps}
+    sweep = {"version": 1, "experiment": sheet, "vary": vary, "keep": KEEP}
     path = folder / "sweep.json"
     path.write_text(json.dumps(sweep))
     line = [sys.executable, "-m", "pbdkit", "sweep", str(path), "-o", str(folder / "fire")]
@@ -78,7 +80,7 @@ def under_fire(folder: Path, members: int, kills: int, workers: int) -> dict[str
             os.kill(chance.choice(children(running.pid)), signal.SIGKILL)
             killed += 1
     code = running.wait()
-    pbdkit.sweep(SHEET, vary=vary, keep=KEEP, folder=folder / "calm", workers=1, progress=False)
+    pbdkit.sweep(sheet, vary=vary, keep=KEEP, folder=folder / "calm", workers=1, progress=False)
     disturbed, calm = digests(folder / "fire"), digests(folder / "calm")
     return {
         "exit": code,

@@ -673,5 +673,5 @@ def test_variables_of_some_members_stay_theirs(small):
 
 
 def test_stress_test(tmp_path):
-    found = under_fire(tmp_path, members=16, kills=1, workers=2)
+    found = under_fire(tmp_path, members=16, kills=1, workers=2, steps=400)
     assert found == {"exit": 0, "killed": 1, "right": 16, "wrong": 0, "run again": 0}
