@@ -198,7 +198,7 @@ def calls_in(code):
     return calls
 
 
-TIMES = re.compile(r"\b[\d.]+ (?:ms|s|min)\b")
+TIMES = re.compile(r"(?<!\w)[\d.]+ (?:ms|s|min)\b")
 
 
 def assert_shown(shown, output):
