@@ -144,8 +144,9 @@ LONGEST_TEST_S = 8.0
 LIMIT_S = 5.0
 """Processor time after which a test is ended, in addition to four times what it needs."""
 COMPILATION_S = 25.0
-"""Additional processor time for areas with code that is compiled."""
+"""Additional processor time where code may be compiled."""
 COMPILED = ("evaluator", "engines")
+"""Areas with code that is compiled."""
 LONGEST_SLEEP_S = 100.0
 """Time after which a process that uses no processor is ended."""
 OPTIONS = ["-q", "-p", "no:cacheprovider", "-o", "addopts="]
@@ -636,14 +637,17 @@ class Trial:
                 continue
             begun = _children_s()
             with self._changed(mutant):
-                verdict = self._judged(self._tests(mutant, patience_s))
+                extra = LIMIT_S + COMPILATION_S
+                verdict = self._judged(self._tests(mutant, patience_s, extra))
             yield mutant, verdict, _children_s() - begun
 
     def replaced(
         self, mutants: Sequence[Mutant], patience_s: float
     ) -> Iterator[tuple[Mutant, str, float]]:
         """Yield those mutants that can be had by replacing the code of functions, with their
-        results, which a process finds that has imported pbdkit and the tests."""
+        results, which a process finds that has imported pbdkit and the tests.
+
+        The result is `slow` if a test exceeded its limit, and is confirmed by `results`."""
         if not mutants:
             return
         source, target = os.pipe()
@@ -666,7 +670,9 @@ class Trial:
                     old = path.read_text()
                     with self._changed(mutant) as new:
                         change = partial(replace_functions, functions, path, old, new)
-                        verdict = self._judged(self._tests(mutant, patience_s), change)
+                        extra = LIMIT_S + COMPILATION_S * (mutant.area in COMPILED)
+                        verdict = self._judged(self._tests(mutant, patience_s, extra), change)
+                    verdict = "slow" if verdict == "timeout" else verdict
                     if verdict != "unchanged":
                         spent = _children_s() - begun
                         print(json.dumps([number, verdict, spent]), file=lines, flush=True)
@@ -708,9 +714,8 @@ class Trial:
         names = [(name, self.versions[name.split("::")[0]]) for part in parts for name in part]
         return hashlib.sha256(json.dumps(names).encode()).hexdigest()
 
-    def _tests(self, mutant: Mutant, patience_s: float) -> list[dict[str, float]]:
+    def _tests(self, mutant: Mutant, patience_s: float, extra: float) -> list[dict[str, float]]:
         """Return tests of a mutant with their limits."""
-        extra = LIMIT_S + COMPILATION_S * (mutant.area in COMPILED)
         parts = self.coverage.tests(mutant, patience_s)
         return [{name: extra + 4 * self.coverage.cost[name] for name in part} for part in parts]
 
@@ -780,9 +785,11 @@ class Results:
         verdict, _ = self.kept.get(self._key(mutant), (None, ""))
         return str(verdict) if verdict else None
 
-    def is_open(self, mutant: Mutant, patience_s: float) -> bool:
-        """Return whether the mutant has no result or survived other tests."""
+    def is_open(self, mutant: Mutant, patience_s: float, *, is_last: bool) -> bool:
+        """Return whether the mutant has no result, was slow or survived other tests."""
         verdict, tests = self.kept.get(self._key(mutant), (None, ""))
+        if verdict == "slow":
+            return is_last
         known = verdict in ("killed", "timeout")
         return not known and tests != self.trial.digest(mutant, patience_s)
 
@@ -817,7 +824,8 @@ def main() -> int:
     trial.prepare()
     trial.check()
     for patience_s, way in ((options.first, trial.replaced), (options.patience, trial.results)):
-        pending = [mutant for mutant in mutants if results.is_open(mutant, patience_s)]
+        is_last = way == trial.results
+        pending = [m for m in mutants if results.is_open(m, patience_s, is_last=is_last)]
         for mutant, verdict, spent in way(pending, patience_s):
             print(f"{mutant.area} | {mutant.name} | {verdict} | {spent:.1f} s", flush=True)
             results.keep(mutant, verdict, patience_s)
