@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from pbdkit.lattice.fill import cut_by_border, has_pieces, shares_inside
+from pbdkit.lattice.fill import _is_separated, cut_by_border, has_pieces, shares_inside
 
 CELLS = {
     "square": [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)],
@@ -140,3 +140,20 @@ def test_pieces_are_those_of_the_region(name, turn):
     assert has_pieces(lambda px, py: signed(1.0 - px, py), x, y) == [are_several]
     if are_several:
         assert shares_inside(signed, x, y)[1]
+
+
+@pytest.mark.parametrize(
+    ("width", "end"), [(1e-3, 0.07), (0.05, 0.07), (0.3, 0.07), (0.05, 0.0), (0.3, 0.0)]
+)
+def test_a_void_between_two_points_separates_them(width, end):
+    """Even if one of the points lies on the outline."""
+
+    def signed(x, y):
+        return width / 2 - np.abs(x - 0.4)
+
+    a, b = np.array([[0.1], [0.0]]), np.array([[0.4 + width / 2 + end], [0.2]])
+    near, far = signed(*a), np.minimum(signed(*b), 0.0) if end else np.zeros(1)
+    assert _is_separated(signed, a, b, near, far).all()
+    assert _is_separated(signed, b, a, far, near).all()
+    beside = np.array([[0.4 - width / 2], [0.2]])
+    assert not _is_separated(signed, a, beside, near, np.zeros(1)).any()

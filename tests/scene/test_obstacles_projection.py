@@ -12,7 +12,16 @@ import numpy as np
 import pytest
 
 from pbdkit.model.boundary_conditions import Obstacle
-from pbdkit.scene.obstacles import Outline, Walls, contact_correction, outline_of
+from pbdkit.scene.obstacles import (
+    CIRCLE,
+    LINE,
+    SEGMENT,
+    Outline,
+    Walls,
+    _meeting,
+    contact_correction,
+    outline_of,
+)
 
 SHAPES: dict[str, dict[str, Any]] = {
     "disc": {"type": "disc", "radius": 2.0, "centre": [0.2, 0.1]},
@@ -180,3 +189,50 @@ def test_corrections_by_large_outlines_leave_no_depth(size: float, angle: float)
     assert all(walls.clearance(x, y) == 0.0 for x, y in moved.T)
     normal = np.array([-s, c])
     np.testing.assert_allclose((normal @ moved)[inside], 0.0, atol=1e-14 * size)
+
+
+def distance_from(face: Any, x: float, y: float) -> float:
+    """Distance of a place from a circle, from a line, or from the ends of a segment."""
+    a, b, c, d, shape = face
+    if shape == CIRCLE:
+        return abs(np.hypot(x - a, y - b) - c)
+    t = ((x - a) * c + (y - b) * d) / (c * c + d * d)
+    t = np.clip(t, 0.0, 1.0) if shape == SEGMENT else t
+    return float(np.hypot(x - a - t * c, y - b - t * d))
+
+
+def crossings(face: Any, other: Any) -> int:
+    """Number of changes of sign of one face along the other one."""
+    a, b, c, d, shape = other
+    t = np.linspace(0.0 if shape != LINE else -60.0, 1.0 if shape != LINE else 60.0, 40001)
+    x, y = a + t * c, b + t * d
+    if shape == CIRCLE:
+        x, y = a + c * np.cos(2 * np.pi * t), b + c * np.sin(2 * np.pi * t)
+    p, q, r, s, like = face
+    side = np.hypot(x - p, y - q) - r if like == CIRCLE else (x - p) * s - (y - q) * r
+    along = ((x - p) * r + (y - q) * s) / (r * r + s * s)
+    on = np.full(len(t), True) if like != SEGMENT else (along >= 0.0) & (along <= 1.0)
+    return int((((side[1:] > 0.0) != (side[:-1] > 0.0)) & on[1:]).sum())
+
+
+@pytest.mark.parametrize("shape", [LINE, SEGMENT, CIRCLE])
+@pytest.mark.parametrize("like", [LINE, SEGMENT, CIRCLE])
+def test_faces_meet_where_both_are(shape: int, like: int) -> None:
+    rng, met = np.random.default_rng(10 * shape + like), 0
+    for _ in range(12):
+        face, other = (
+            (*rng.uniform(-1.0, 1.0, 2), *rng.uniform(0.5, 3.0, 2) * rng.choice([1.0, -1.0], 2), k)
+            for k in (shape, like)
+        )
+        face, other = ((a, b, abs(c), 0.0, k) if k == CIRCLE else (a, b, c, d, k)
+                       for a, b, c, d, k in (face, other))  # fmt: skip
+        with np.errstate(all="ignore"):
+            points = np.reshape(_meeting(face, other), (2, 2))
+        points = points[~np.isnan(points).any(axis=1)]
+        for x, y in points:
+            assert distance_from(face, x, y) < 1e-9
+            assert distance_from(other, x, y) < 1e-9
+        count = len(np.unique(points.round(9), axis=0))
+        assert count == crossings(face, other)
+        met += count
+    assert met

@@ -13,7 +13,7 @@ from scene_strategies import in_turn
 import pbdkit
 from pbdkit.equilibrium import load_stepping as increments
 from pbdkit.equilibrium.contact_system import NO_FACE, hold
-from pbdkit.scene.obstacles import outlines_at
+from pbdkit.scene.obstacles import Walls, contact_correction, outlines_at
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.contact import Contact
 from pbdkit.stepping.numba_engine.engine import CompiledStepper
@@ -473,3 +473,58 @@ def test_colliding_plates_leave_particles_at_least_depth() -> None:
     state = Stepper(scene).advance(initial_state(scene), 3)
     assert np.isfinite(state.u).all()
     assert np.abs(state.u).max() < 9.0
+
+
+@pytest.mark.parametrize(
+    "lattice",
+    [
+        {"type": "square", "a": 1.0},
+        {"type": "rectangular", "a": 1.0, "b": 2.3},
+        {"type": "hexagonal", "a": 1.0},
+    ],
+    ids=lambda lattice: lattice["type"],
+)
+def test_exactly_the_particles_inside_an_obstacle_are_pushed(lattice: Any) -> None:
+    """Whichever part of the body the obstacle covers, for every displacement of the body. The
+    displacements are those of the function for single particles, to the last bit."""
+    normals = ([1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0], [0.3, -1.0], [-1.0, 0.2])
+    shapes = [{"half_plane": {"point": [4.4, 3.3], "normal": normal}} for normal in normals]
+    shapes += [{"type": "disc", "radius": 2.7, "centre": at} for at in ([0.3, 0.2], [8.8, 6.9])]
+    for shape in shapes:
+        given = block(
+            lattice=lattice,
+            neighbours=(TRIANGLES if lattice["type"] == "hexagonal" else SQUARE)["neighbours"],
+            body={"type": "rectangle", "width": 9.2, "height": 7.1},
+            rule=ELASTIC, leaders=[], steps=3,
+            obstacles=[{"shape": shape, "from": 2}],
+        )  # fmt: skip
+        scene = build_scene(pbdkit.Experiment(**given))
+        contact, raster = Contact(scene), scene.raster
+        place = raster.place_of(raster.body_rows)
+        ((_, outline),) = outlines_at(scene.barriers, 2)
+        walls = Walls.of([outline])
+        for shift in (0.0, 0.9):
+            u = np.full((2, *raster.shape), shift)
+            at = contact.positions(u, place)
+            inside = outline.facing(*at)[0] < 0.0
+            assert 0 < inside.sum() < len(place)
+            contact.push_out(u, 2)
+            w = u.reshape(2, -1)[:, place] - shift
+            np.testing.assert_array_equal((w != 0.0).any(axis=0), inside)
+            one = int(np.flatnonzero(inside)[-1])
+            C = contact.compliance_at(place[[one]])[:, 0]
+            exact = contact_correction(*at[:, one], *C, 0, *walls)
+            np.testing.assert_array_equal(u.reshape(2, -1)[:, place[one]], np.array(exact) + shift)
+
+
+@pytest.mark.parametrize("axes", [["x"], ["y"]])
+def test_guided_particles_are_pushed_along_their_free_axis_only(axes: Any) -> None:
+    guided = {"select": {"edge": "right"}, **displaced(0.0, 0.0), "axes": axes}
+    hold = {"select": {"edge": "left"}, "motion": {"type": "hold"}}
+    shape = {"half_plane": {"point": [13.5, 0.0], "normal": [-1.0, 0.6]}}
+    given = block(leaders=[hold, guided], obstacles=[{"shape": shape, "from": 2}], steps=3)
+    scene = build_scene(pbdkit.Experiment(**given))
+    place = scene.leading[1].place
+    w = Contact(scene).corrections(np.zeros((2, *scene.raster.shape)), place, 2)
+    for axis, name in enumerate("xy"):
+        assert w[axis].any() == (name not in axes)
