@@ -482,6 +482,8 @@ class PanelFigure:
         if scale and is_each:
             text = label(quantity.meaning, quantity.units)
             scale = in_shares(scale)
+        if self._extent.is_zero:
+            text += ": zero within rounding"
         of_kinds = self._style.dots == "kinds"
         palette = OF_KINDS if of_kinds else self._palette
         if page:

@@ -4,7 +4,7 @@ of the longest crack."""
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -167,7 +167,9 @@ def _extents(middle: Array) -> Array:
 
 
 def _map(dataset: xarray.Dataset, broken: CrackBonds, title: str, ax: Axes | None) -> Axes:
-    body = dataset["reference"].values[dataset["role"].values == OF_BODY]
+    factor, units = in_its_units(dataset["reference"].attrs)
+    body = factor * dataset["reference"].values[dataset["role"].values == OF_BODY]
+    broken = replace(broken, ends=factor * broken.ends)
     is_new, ax = ax is None, ax or _axes_around(body)
     dots = body[:: 1 + len(body) // MAX_PARTICLES]
     size = min(max(DOT_SIZE_PT / np.sqrt(len(body)), 1.2), 6.0)
@@ -185,9 +187,6 @@ def _map(dataset: xarray.Dataset, broken: CrackBonds, title: str, ax: Axes | Non
             ax.add_collection(lines, autolim=False)
     if len(later) > 1:
         _coloured(ax, broken, below=_is_long(body))
-    factor, units = in_its_units(dataset["reference"].attrs)
-    for scaled in (ax.xaxis, ax.yaxis):
-        scaled.set_major_formatter(lambda place, _: f"{factor * place:.6g}")
     x, y = (label(axis, units, width=BROAD) for axis in "xy")
     ax.set(aspect="equal", title=label(title, width=BROAD), xlabel=x, ylabel=y)
     ax.margins(0.04)

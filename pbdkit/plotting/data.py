@@ -444,6 +444,11 @@ def _words(attributes: dict[Any, Any]) -> dict[int, str]:
     return dict(zip(map(int, values), str(attributes["flag_meanings"]).split(), strict=False))
 
 
+ROUNDING = 1e-12
+"""Fraction of the largest value of a run up to which values count as rounding errors. For energies,
+which are squares, it is the square of this number."""
+ROUNDING_STEPS = 8
+"""Number of recorded steps at which the largest value of a run is determined."""
 BLOCK_BYTES = 2**26
 """Approximate number of bytes that are read from a file at once."""
 UNKNOWN = FRAME + 1
@@ -586,6 +591,20 @@ class Trajectory:
             reference, site, numbers, inside, ends, broken, outside, shape, lattice_unit(dataset)
         )
 
+    @cached_property
+    def rounding(self) -> float:
+        """Magnitude up to which values are rounding errors. It is a fraction of the largest value
+        at some recorded steps, and 0 for positions, classes and integers."""
+        quantity = self.quantity
+        if quantity is None or quantity.is_place or quantity.words or quantity.whole:
+            return 0.0
+        last = len(self.steps) - 1
+        rows = np.unique(np.linspace(0, last, ROUNDING_STEPS).round().astype(int)).tolist()
+        ranges = [value_range(snapshot.values) for snapshot in self.snapshots(rows)]
+        squared = quantity.variable.startswith("pe") or "energy" in quantity.variable
+        share = ROUNDING**2 if squared else ROUNDING
+        return share * max(map(abs, _joined(ranges, (0.0, 0.0))))
+
     def row(self, time: float | None) -> int:
         """Return the index of a step; None means the last step. Raises ExperimentError if the step
         was not recorded."""
@@ -699,13 +718,15 @@ class Extent:
     """Extent of several steps. `box` is the bounding box (left, right, bottom, top). `of_body`
     contains the lowest and the highest value in the body, and `of_all` contains those in the body
     and the frame. `kinds` are the kinds of particles that occur, and `classes` the classes of the
-    quantity that occur."""
+    quantity that occur. `is_zero` is true if all values are rounding errors, in comparison with
+    other recorded steps; both ranges are then zero."""
 
     box: Box
     of_body: tuple[float, float]
     of_all: tuple[float, float]
     kinds: frozenset[int]
     classes: frozenset[int]
+    is_zero: bool = False
 
 
 def extent_of(recording: Trajectory, snapshots: Iterable[Snapshot], look: PlotOptions) -> Extent:
@@ -738,7 +759,13 @@ def extent_of(recording: Trajectory, snapshots: Iterable[Snapshot], look: PlotOp
     margin = max(body.spacing, MARGIN * float(np.max(highest - lowest)))
     (xmin, ymin), (xmax, ymax) = lowest - margin, highest + margin
     box = _no_thinner(*(look.window or (xmin, xmax, ymin, ymax)))
-    return Extent(box, _joined(inner), _joined(outer), frozenset(kinds), frozenset(classes))
+    of_body, of_all = _joined(inner), _joined(outer)
+    is_zero = False
+    if look.limits == "all" and look.norm in ("linear", "sqrt") and any(of_all):
+        is_zero = max(map(abs, of_all)) <= recording.rounding
+    if is_zero:
+        of_body = of_all = (0.0, 0.0)
+    return Extent(box, of_body, of_all, frozenset(kinds), frozenset(classes), is_zero)
 
 
 def combine(extents: Sequence[Extent]) -> Extent:
@@ -751,6 +778,7 @@ def combine(extents: Sequence[Extent]) -> Extent:
         _joined([e.of_all for e in extents]),
         frozenset().union(*(e.kinds for e in extents)),
         frozenset().union(*(e.classes for e in extents)),
+        all(e.is_zero for e in extents),
     )
 
 
@@ -792,17 +820,19 @@ def coloured_values(
     return np.asarray(snapshot.values[rows])
 
 
-def value_range(values: Array) -> tuple[float, float]:
+def value_range(values: Array | None) -> tuple[float, float]:
     """Return the lowest and the highest value. Both are NaN if there are no values."""
-    finite = values[np.isfinite(values)]
+    finite = np.empty(0) if values is None else values[np.isfinite(values)]
     return (float(finite.min()), float(finite.max())) if len(finite) else (np.nan, np.nan)
 
 
-def _joined(ranges: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    """Return the smallest range that contains several ranges. It is (0, 1) if none of them is
+def _joined(
+    ranges: Sequence[tuple[float, float]], otherwise: tuple[float, float] = (0.0, 1.0)
+) -> tuple[float, float]:
+    """Return the smallest range that contains several ranges. It is `otherwise` if none of them is
     finite."""
     finite = [r for r in ranges if np.isfinite(r[0])]
-    return (min(r[0] for r in finite), max(r[1] for r in finite)) if finite else (0.0, 1.0)
+    return (min(r[0] for r in finite), max(r[1] for r in finite)) if finite else otherwise
 
 
 SUM_BLOCK_BYTES = 2**25

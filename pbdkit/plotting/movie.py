@@ -72,7 +72,7 @@ def animate(
     *,
     fps: float = 25.0,
     every: int = 1,
-    show: Show = silent,
+    show: Show | None = None,
     replace: bool = True,
     **options: Unpack[PlotKeywords],
 ) -> None:
@@ -90,7 +90,7 @@ def animate(
         Recorded steps per second.
     every : int
         Draw every n-th recorded step only, and the last.
-    show : callable
+    show : callable, optional
         Function that is called with a text and the completed fraction, from 0 to 1.
     replace : bool
         Replace an existing file.
@@ -113,6 +113,7 @@ def animate(
     _refuse_speed(path, fps, every)
     look = PlotOptions(**options)
     recording = Trajectory(dataset, color or "kind")
+    show = show or silent
     rows = [*range(0, len(recording.steps), every)]
     rows += [] if rows[-1] == len(recording.steps) - 1 else [len(recording.steps) - 1]
     moving = MovieFigure(recording, rows, look, show)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, cast
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic.errors import PydanticUserError
 from pydantic_core import PydanticCustomError
 
 from pbdkit.errors import AnswerError, did_you_mean, printable
@@ -19,7 +21,37 @@ Pair = Annotated[tuple[float, float], Field(strict=False)]
 """Type of a pair of numbers (x, y), which is a list of two numbers in an experiment file."""
 
 
-class Strict(BaseModel):
+if TYPE_CHECKING:
+    from pydantic._internal._model_construction import ModelMetaclass
+else:
+    ModelMetaclass = type(BaseModel)
+UNTYPED = ("model-field-overridden", "model-field-missing-annotation")
+"""Codes of the errors of pydantic about attributes without a type."""
+
+
+class Parameters(ModelMetaclass):
+    """Metaclass of models, with messages for attributes without a type."""
+
+    def __new__(
+        mcs, name: str, bases: tuple[type, ...], namespace: dict[str, Any], **options: Any
+    ) -> Any:
+        """Create a class. TypeError is raised if an attribute has no type."""
+        try:
+            return super().__new__(mcs, name, bases, namespace, **options)
+        except PydanticUserError as error:
+            attribute = re.search(r"['`](\w+)", error.message)
+            if error.code not in UNTYPED or not attribute:
+                raise
+            word = attribute[1]
+        value, kind = repr(namespace.get(word)), type(namespace.get(word)).__name__
+        parameter, constant = f"{word}: {kind} = {value}", f"{word}: ClassVar[{kind}] = {value}"
+        remedy = f"write `{parameter}` for a parameter, or `{constant}` for a constant of the class"
+        if word == "type":
+            remedy = f"write `type: Literal[{value}] = {value}`"
+        raise TypeError(f"{name}.{word} has no type; {remedy}")
+
+
+class Strict(BaseModel, metaclass=Parameters):
     """Frozen pydantic model that accepts only finite numbers and known keys.
 
     Types are not converted: "10", True and 10.0 are not accepted as the integer 10. The message for
@@ -44,6 +76,20 @@ class Strict(BaseModel):
     def known_keys(cls) -> list[str]:
         """Return the keys that an experiment file may contain."""
         return [field.alias or name for name, field in cls.model_fields.items()]
+
+    if not TYPE_CHECKING:  # A type checker reports assignments without it.
+
+        def __setattr__(self, name: str, value: Any) -> None:
+            """Set a private attribute. AttributeError is raised for a parameter."""
+            if name in type(self).model_fields:
+                owner = type(self).__name__
+                path = name if owner == "Experiment" else f"PART.{name}"
+                raise AttributeError(
+                    f"{owner}.{name} cannot be assigned, because parameters do not change; "
+                    f'experiment.with_settings({{"{path}": {value!r}}}) returns an experiment with '
+                    "the new value"
+                )
+            super().__setattr__(name, value)
 
     @model_validator(mode="before")
     @classmethod

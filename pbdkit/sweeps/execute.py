@@ -63,6 +63,7 @@ from pbdkit.sweeps.worker import (
     STORED_STATUSES,
     MemberReport,
     begin_worker,
+    chosen_columns,
     report_of,
     run_member,
     run_members,
@@ -305,8 +306,8 @@ class SizeEstimate:
             text = f"keep.times: {min(keep.times)} exceeds the last step of all members, {last}"
             raise ExperimentError(text, ("keep", "times"))
         sizes = self._sizes | {"time": self._number_of_times()}
-        names = self._columns if keep.variables is None else keep.variables
-        columns = [self._columns[name] for name in names]
+        names = None if keep.variables is None else {*keep.variables}
+        columns = chosen_columns(self._columns.values(), names)
         each = sum(math.prod(sizes.get(d, 1) for d in c.dims) * _bytes(c) for c in columns)
         if each * self._count > (limit := int(SHARE * machine_memory())):
             raise ExperimentError(

@@ -26,6 +26,7 @@ from pbdkit.errors import ExperimentError, PbdkitError, PluginError
 from pbdkit.hooks import worded
 from pbdkit.io.atomic_file import WHOLE
 from pbdkit.io.layout import Column, Values, When
+from pbdkit.io.physical import TWIN_OF
 from pbdkit.io.sinks import MemorySink
 from pbdkit.model.experiment import Experiment
 from pbdkit.model.reading import Source
@@ -157,12 +158,21 @@ class SelectiveSink(MemorySink):
         return MemberVariable(column.dims, values, column.attributes, column.coordinate, fixed)
 
 
+def chosen_columns(columns: Iterable[Column], variables: set[str] | None) -> list[Column]:
+    """Return the columns of the given variables with their copies in mm."""
+    return [
+        c
+        for c in columns
+        if variables is None or c.name in variables or c.extra.get(TWIN_OF) in variables
+    ]
+
+
 def selected_columns(columns: list[Column], variables: set[str] | None) -> list[Column]:
     """Return the columns of the given variables, and the coordinates of their dimensions.
 
     For variables of particles the reference positions are included too.
     """
-    chosen = [c for c in columns if variables is None or c.name in variables]
+    chosen = chosen_columns(columns, variables)
     dims = {dim for column in chosen for dim in column.dims}
     if "particle" in dims:
         dims.add("axis")

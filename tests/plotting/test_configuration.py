@@ -602,6 +602,25 @@ def test_figures_belong_to_pyplot_if_it_is_in_use(tmp_path):
     assert len(plt.get_fignums()) == before + 2
 
 
+def test_rounding_errors_of_the_last_step_are_drawn_as_zero():
+    ds = pbdkit.run(pbdkit.load("paper/a", settings=["steps=3"]), progress=False)
+    noise = np.random.default_rng(1).normal(size=ds.pe1.shape)
+    noise[-1] *= 1e-13
+    ds["stress"] = ds.pe1.copy(data=noise)
+    dots = next(c for c in plot(ds, "stress").collections if isinstance(c, PathCollection))
+    assert (dots.norm.vmin, dots.norm.vmax) == (0.0, 1.0)
+    bar = dots.figure.axes[-1]
+    assert bar.get_ylabel().replace("\n", " ").endswith(": zero within rounding")
+    for options in ({"limits": "each"}, {"time": 2}):
+        dots = next(
+            c for c in plot(ds, "stress", **options).collections if isinstance(c, PathCollection)
+        )
+        assert dots.norm.vmin < 0.0
+    ds["stress"][-1] *= 100.0
+    dots = next(c for c in plot(ds, "stress").collections if isinstance(c, PathCollection))
+    assert 0.0 < dots.norm.vmax < 1e-10
+
+
 WINDOW = (1.5, 5.5, -0.5, 3.5)
 
 

@@ -452,12 +452,15 @@ def test_members_are_labelled_by_the_types_of_their_components():
 
 def test_axes_of_a_crack_are_in_mm_with_units(torn):
     scaled = torn.copy()
-    scaled["reference"].attrs |= {"physical_units": "mm", "physical_factor": 2.0}
+    scaled["reference"].attrs |= {"physical_units": "mm", "physical_factor": 1.27}
     ax = scaled.pbd.crack()
     ax.figure.canvas.draw()
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("x (mm)", "y (mm)")
-    texts = [float(text.get_text()) for text in ax.get_xticklabels()]
-    np.testing.assert_allclose(texts, 2.0 * ax.get_xticks())
+    texts = [float(text.get_text().replace("−", "-")) for text in ax.get_xticklabels()]
+    assert texts == ax.get_xticks().tolist()
+    assert np.diff(texts).tolist() == [1.0] * (len(texts) - 1)
+    (line,) = ax.lines
+    assert line.get_xdata().max() == pytest.approx(1.27 * torn.reference[:, 0].max() - 1.27)
 
 
 def test_crack_is_drawn_as_its_broken_bonds(torn):

@@ -7,10 +7,12 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import pytest
 from plugin_sources import rule
+
+import pbdkit
 
 Install = Callable[..., None]
 Call = Callable[..., Any]
@@ -150,3 +152,27 @@ def test_diagnostic_with_unknown_variables_leaves_the_schema_open(
     described = json.loads(call("schema", "dataset").out)
     assert "probe" not in described["properties"]["data_vars"]["properties"]
     assert "pe1" in described["properties"]["data_vars"]["properties"]
+
+
+def test_attributes_without_a_type_are_reported_with_the_remedy():
+    with pytest.raises(TypeError) as lazy:
+
+        class Lazy(pbdkit.Diagnostic):
+            type = "lazy"
+
+    assert str(lazy.value) == "Lazy.type has no type; write `type: Literal['lazy'] = 'lazy'`"
+    with pytest.raises(TypeError, match=r"Slow\.limit has no type; write `limit: int = 3` for a"):
+
+        class Slow(pbdkit.Diagnostic):
+            type: Literal["slow"] = "slow"
+            limit = 3
+
+
+def test_assignment_of_a_parameter_names_the_copy_with_a_new_value():
+    loaded = pbdkit.load("paper/a")
+    with pytest.raises(AttributeError, match=r'experiment\.with_settings\({"steps": 3}\)'):
+        loaded.steps = 3
+    with pytest.raises(AttributeError, match=r'Grid\.columns cannot.*{"PART.columns": 3}'):
+        loaded.body.columns = 3
+    changed = loaded.with_settings({"body.columns": 3})
+    assert (changed.body.columns, loaded.body.columns) == (3, 10)

@@ -43,6 +43,12 @@ def test_parameters_have_names_units_and_their_paths(swept):
     assert (said["span"]["units"], swept.span.values.tolist()) == ("mm", [7.0, 8.0])
 
 
+def test_copies_in_mm_are_kept(swept):
+    assert {"u", "u_mm"} == {*swept.data_vars} - {"status", "message"}
+    np.testing.assert_array_equal(swept.u_mm, swept.u)
+    assert swept.u_mm.attrs["units"] == "mm"
+
+
 @pytest.mark.parametrize(
     ("paths", "names"),
     [
