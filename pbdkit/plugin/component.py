@@ -81,7 +81,7 @@ class Strict(BaseModel, metaclass=Parameters):
 
         def __setattr__(self, name: str, value: Any) -> None:
             """Set a private attribute. AttributeError is raised for a parameter."""
-            if name in type(self).model_fields:
+            if name in type(self).model_fields and self.model_config.get("frozen"):
                 owner = type(self).__name__
                 path = name if owner == "Experiment" else f"PART.{name}"
                 raise AttributeError(

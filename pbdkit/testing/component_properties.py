@@ -118,7 +118,7 @@ def is_frozen(subject: Subject) -> None:
     components and compare them by value."""
     component = subject.component
     for name in type(component).model_fields:
-        with suppress(ValidationError):
+        with suppress(AttributeError):
             setattr(component, name, getattr(component, name))
             raise PropertyError(
                 f"`{name}` can be assigned; do not change `frozen` in `model_config`"

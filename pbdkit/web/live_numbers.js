@@ -4,7 +4,10 @@ import { labelled, make } from "./dom.js";
 
 const APART_MS = 100; // between two values that are handed on
 
-export function numberRow({ name, span: [low, high] }, send) {
+/** `span` and sent values are in lattice units; times `factor` they are in `units`, which are shown. */
+export function numberRow({ name, span, units, factor }, send) {
+  const [low, high] = span.map((value) => value * factor);
+  const title = units ? `${name} (${units})` : name;
   let last = 0, waiting = null, current = null, touched = 0;
   const turn = (value) => {
     if (!Number.isFinite(value)) return show(current);
@@ -14,22 +17,22 @@ export function numberRow({ name, span: [low, high] }, send) {
     const wait = Math.max(0, last + APART_MS - touched);
     waiting = setTimeout(() => {
       last = performance.now();
-      send({ do: "turn", name, value });
+      send({ do: "turn", name, value: value / factor });
     }, wait);
   };
-  const range = slider(name, low, high, "any", (value) => turn(Number(value.toPrecision(4))));
+  const range = slider(title, low, high, "any", (value) => turn(Number(value.toPrecision(4))));
   const field = make("input", {
-    type: "text", inputMode: "decimal", spellcheck: false, "aria-label": `${name}, as a number`,
+    type: "text", inputMode: "decimal", spellcheck: false, "aria-label": `${title}, as a number`,
     onchange: () => turn(Number(field.value.replace(",", "."))),
   });
   const show = (value) => {
     if (value === undefined || value === null) return;
     current = value;
     if (performance.now() - touched < 3 * APART_MS) return; // the user is changing it
-    range.value = value;
-    if (document.activeElement !== field) field.value = shortened(value);
+    range.value = value * factor;
+    if (document.activeElement !== field) field.value = shortened(value * factor);
   };
-  const element = make("div", { className: "number" }, labelled(name, field), range);
+  const element = make("div", { className: "number" }, labelled(title, field), range);
   return { name, show, element };
 }
 

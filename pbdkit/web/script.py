@@ -10,6 +10,7 @@ import csv
 import io
 import json
 import math
+import re
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from copy import copy, deepcopy
@@ -29,6 +30,7 @@ from pbdkit.model.motions import Motion, Path
 from pbdkit.model.reading import MAX_BYTES, MAX_NODES, yaml_text
 from pbdkit.plugin.fracture_model import Segment
 from pbdkit.plugin.schedule import TimeDependentNumber
+from pbdkit.plugin.units import TEXT as WITH_UNIT
 
 Displacement = tuple[float, float]
 
@@ -116,12 +118,15 @@ class AdjustableNumber:
 
     `initial` is the number or the schedule in the experiment. `turns` are the steps after which it
     was changed, each with the new value. `bounds` are the bounds of the number, and `span` is the
-    range of its slider.
+    range of its slider. A value in lattice units times `factor` is in `units`, which are those of
+    the experiment file.
     """
 
     name: str
     initial: float | dict[str, Any]
     bounds: tuple[float, float]
+    units: str = ""
+    factor: float = 1.0
     turns: list[tuple[int, float]] = field(default_factory=list)
 
     @property
@@ -202,12 +207,26 @@ def numbers_of(experiment: Experiment, parts: dict[str, Any]) -> dict[str, Adjus
     numbers = {}
     for name, value in _candidates(parts):
         number = AdjustableNumber(name, value, _bounds(experiment, name))
+        if unit := _written(experiment, number.where):
+            number.units, number.factor = unit[2], float(unit[1]) / (number.at(0) or 1.0)
         with suppress(PbdkitError):
             experiment.of_parts(
                 with_number(parts, number, number.turned(number.at(0) * TEST_FACTOR or TEST_VALUE))
             )
             numbers[name] = number
     return numbers
+
+
+def _written(experiment: Experiment, where: tuple[str | int, ...]) -> re.Match[str] | None:
+    """Return the number and the unit of a value as written in the experiment, or None for a value
+    without a unit."""
+    value: Any = experiment.as_written().data
+    for key in where:
+        try:
+            value = value[key]
+        except (KeyError, IndexError, TypeError):
+            return None
+    return WITH_UNIT.fullmatch(value) if isinstance(value, str) else None
 
 
 def with_number(parts: dict[str, Any], number: AdjustableNumber, value: Any) -> dict[str, Any]:

@@ -627,7 +627,13 @@ def static_message(session: Session) -> Message:
         "beyond": _as_text(camera.beyond, "<f4"),
         "fields": camera.fields.labels,
         "numbers": [
-            {"name": number.name, "span": number.span} for number in session.script.numbers.values()
+            {
+                "name": number.name,
+                "span": number.span,
+                "units": number.units,
+                "factor": number.factor,
+            }
+            for number in session.script.numbers.values()
         ],
     }
 

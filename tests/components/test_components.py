@@ -76,7 +76,7 @@ every_rule = pytest.mark.parametrize(
 def test_components_are_frozen(component):
     before = component.model_dump()
     for name in type(component).model_fields:
-        with pytest.raises(ValidationError, match="frozen"):
+        with pytest.raises(AttributeError, match="cannot be assigned"):
             setattr(component, name, getattr(component, name))
     assert component.model_dump() == before
     assert hash(component) == hash(component.model_copy())

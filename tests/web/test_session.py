@@ -33,6 +33,7 @@ from pbdkit.simulation import Simulation
 from pbdkit.web import script as saving, session as history, session as stage
 from pbdkit.web.command_line import live
 from pbdkit.web.requests import MAX_COMMAND_BYTES, MAX_COORDINATE, command_of, execute
+from pbdkit.web.script import numbers_of, parts_of
 from pbdkit.web.server import Access, Conductor, SessionServer, SocketViewer
 from pbdkit.web.session import Session, judged, static_message, status_message
 from pbdkit.web.widget import LiveWidget
@@ -436,6 +437,16 @@ def test_refused_action_keeps_earlier_ones(command, back, tmp_path, monkeypatch)
     do(session, do="rewind", step=8)
     do(session, do="save")
     assert_same(session.state, run_of(tmp_path / "made.yaml"))
+
+
+def test_numbers_are_in_the_units_of_the_experiment_file():
+    loaded = pbdkit.load(
+        "paper/d1", settings=["units={length: 2 mm}", "fracture.thresholds=[8.4 mm]"]
+    )
+    numbers = numbers_of(loaded, parts_of(loaded))
+    threshold, relaxation = numbers["fracture.thresholds.0"], numbers["solver.relaxation"]
+    assert (threshold.at(0), threshold.units, threshold.factor) == (4.2, "mm", 2.0)
+    assert (relaxation.units, relaxation.factor) == ("", 1.0)
 
 
 def test_parameters_of_random_draws_cannot_be_changed(tmp_path):
