@@ -154,7 +154,7 @@ def test_repeating_runs_nothing_and_extending_runs_only_new_members(small, tmp_p
 
 
 def test_failures_are_reported_and_stop_no_other_member(call, small):
-    sweep = {"experiment": small | {"steps": 3000},
+    sweep = {"experiment": small | {"steps": 600},
              "vary": {"solver.relaxation": [0.5, 5.0, 1.0]}, "keep": {"times": "last"}}  # fmt: skip
     Path("s.json").write_text(json.dumps(sweep))
     done = call("sweep", "s.json", "--workers", "1")
@@ -488,7 +488,7 @@ def test_the_experiment_is_a_file_beside_the_sweep_or_a_shipped_one(call, tmp_pa
 def test_stopped_sweep_resumes(small, tmp_path):
     """Ctrl-C reaches the program and its workers, as from a terminal."""
     path = tmp_path / "s.json"
-    sweep = {"experiment": small | {"steps": 4000}, "vary": {"seed": [*range(30)]},
+    sweep = {"experiment": small | {"steps": 2000}, "vary": {"seed": [*range(30)]},
              "keep": {"variables": ["pe1"], "times": "last"}}  # fmt: skip
     path.write_text(json.dumps(sweep))
     line = [sys.executable, "-m", "pbdkit", "sweep", str(path), "-o", str(tmp_path / "out")]
