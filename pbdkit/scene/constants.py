@@ -351,6 +351,8 @@ class SceneConstants:
     def limits_at(self, slot: Slot, plane: int, owner: Where) -> Any:
         """Return the limits of the bonds along a slot. `plane` is the index of the plane in which
         the bonds are stored, and `owner` are the places at which they are stored."""
+        if not self.by_bond:
+            return self.limits[slot]
         values = {name: owner.within(planes[plane]) for name, planes in self.by_bond.items()}
         return self.limits[slot]._replace(**values)
 

@@ -9,7 +9,6 @@ import pbdkit
 from pbdkit.io.vtkhdf import BOND, CELL, PARTICLE, export
 from pbdkit.scene.scene import build_scene
 
-vtk = pytest.importorskip("vtk")
 HELD = {"select": {"edge": "left"}, "motion": {"type": "hold"}}
 TORN = {
     "leaders": [HELD, pull_right(0.3, 0.0, 8)],
@@ -22,6 +21,7 @@ TORN = {
 
 def grids(path):
     """Yield what vtk reads from a file: the grid of each step, with its time."""
+    vtk = pytest.importorskip("vtk")  # It takes long to import, and not every worker needs it.
     reader = vtk.vtkHDFReader()
     reader.SetFileName(str(path))
     reader.UpdateInformation()

@@ -17,6 +17,7 @@ import sys
 import tempfile
 import time
 import traceback
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +52,7 @@ each `MEMORY` / 4 that the scene takes."""
 def case(seed: int, number: int) -> tuple[bytes, list[str]]:
     """The file of that number, and the settings that go with it."""
     draw = random.Random(f"{seed}/{number}")
-    text = to_yaml(draw, mutant(draw, BASES)) if draw.random() < 0.5 else draw.choice(TEXTS)
+    text = to_yaml(draw, mutant(draw, bases())) if draw.random() < 0.5 else draw.choice(TEXTS)
     settings = [hostile_setting(draw)] if draw.random() < 0.1 else []
     if draw.random() < 0.5:
         return hostile_text(draw, text), settings
@@ -137,20 +138,22 @@ def faults(outcome: Outcome, slack: float = 1.0) -> list[str]:
 def warm_up() -> None:
     """Import all modules and build every model before anything is measured."""
     for part in [{}, *({name: part} for name, part in PARTS)]:
-        tried(json.dumps(BASES[0] | part).encode(), [])
+        tried(json.dumps(bases()[0] | part).encode(), [])
     for text in TEXTS:
         read_text(text, "shipped")
-    for base in BASES:
+    for base in bases():
         Experiment.build(Source(data=base))
     gc.collect()
     gc.freeze()  # what is there already is not gone through again and again
 
 
-def _base(name: str) -> Any:
-    return json.loads(pbdkit.load(name).model_dump_json(by_alias=True))
+@cache
+def bases() -> list[Any]:
+    """Return the shipped experiments with all defaults."""
+    loaded = map(pbdkit.load, shipped_names())
+    return [json.loads(experiment.model_dump_json(by_alias=True)) for experiment in loaded]
 
 
-BASES = [_base(name) for name in shipped_names()]
 TEXTS = [shipped_text(name) for name in shipped_names()]
 
 

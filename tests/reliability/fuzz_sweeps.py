@@ -22,7 +22,7 @@ from typing import Any
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # others' threads take their time, too
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parent.parent)]
 import fuzz_experiments
-from fuzz_experiments import BASES, MEMORY, PATIENCE_S, marks, undocumented
+from fuzz_experiments import MEMORY, PATIENCE_S, bases, marks, undocumented
 from hostile_input import mutant
 from hostile_text import hostile_text, to_yaml
 from isolation import Outcome, forget_peak, outcomes, report, resident, serve
@@ -50,7 +50,7 @@ def case(seed: int, number: int) -> bytes:
     draw = random.Random(f"{seed}/{number}")
     data: dict[str, Any] = {"version": 1, "experiment": draw.choice(NAMES)}
     if draw.random() < 0.6:
-        data["experiment"] = draw.choice([draw.choice(BASES), mutant(draw, BASES)])
+        data["experiment"] = draw.choice([draw.choice(bases()), mutant(draw, bases())])
     for section in draw.choice([["vary"], ["together"], ["vary", "together"], []]):
         data[section] = {draw.choice(PATHS): _values(draw) for _ in range(draw.randint(1, 3))}
     if draw.random() < 0.3:
