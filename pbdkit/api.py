@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pbdkit.errors import DivergedError, ExperimentError, ReproducibilityWarning, warn_caller
+from pbdkit.hooks import pbdkit_version
 from pbdkit.io.layout import experiment_of as experiment_of, json_attribute
 from pbdkit.io.sinks import MemorySink, Sink
 from pbdkit.model.experiment import Experiment
@@ -355,7 +355,7 @@ def resume(
 
 
 def _warn_of_versions(dataset: xarray.Dataset, experiment: Experiment) -> None:
-    installed = {"pbdkit": version("pbdkit")} | experiment.distributions()
+    installed = {"pbdkit": pbdkit_version()} | experiment.distributions()
     made_by = {"pbdkit": dataset.attrs.get("pbdkit_version")} | json_attribute(dataset, "plugins")
     for name, current in installed.items():
         original = made_by.get(name)

@@ -16,6 +16,7 @@ import warnings
 from collections.abc import Callable
 from contextlib import chdir, redirect_stdout, suppress
 from dataclasses import dataclass, replace
+from functools import cache
 from importlib import import_module
 from importlib.metadata import Distribution, EntryPoint, distribution, distributions, version
 from pathlib import PurePath, PureWindowsPath
@@ -36,6 +37,12 @@ These modules are imported when commands are listed; the modules of the group "p
 hookspec = pluggy.HookspecMarker(GROUP)
 hookimpl = pluggy.HookimplMarker(GROUP)
 """Marks a function of a plugin as the implementation of a hook of the same name."""
+
+
+@cache
+def pbdkit_version() -> str:
+    """Return the version of pbdkit. The metadata of the distribution are read once."""
+    return version(GROUP)
 
 
 def import_object(target: str) -> Any:

@@ -22,13 +22,13 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
-from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.errors import StorageError
+from pbdkit.hooks import pbdkit_version
 
 if TYPE_CHECKING:
     from pbdkit.model.experiment import Experiment
@@ -88,7 +88,7 @@ class Checkpoint:
             "steps": experiment.steps,
             "experiment": experiment.model_dump_json(by_alias=True),
             "plugins": experiment.distributions(),
-            "pbdkit": version("pbdkit"),
+            "pbdkit": pbdkit_version(),
         }
         return cls(about, facts, arrays)
 

@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
-from importlib.metadata import version
 from itertools import chain, compress
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +15,7 @@ import numpy as np
 
 from pbdkit.components.diagnostics import Displacement
 from pbdkit.errors import AccuracyWarning, PluginError, WarningText
+from pbdkit.hooks import pbdkit_version
 from pbdkit.io import layout
 from pbdkit.io.checkpoint import RecordedSteps
 from pbdkit.io.layout import Column, Values, When, diagnostic_column
@@ -371,7 +371,7 @@ def provenance_of(experiment: Experiment) -> dict[str, str]:
         "Conventions": layout.CONVENTIONS,
         "schema_version": layout.SCHEMA_VERSION,
         "title": experiment.name,
-        "pbdkit_version": version("pbdkit"),
+        "pbdkit_version": pbdkit_version(),
         "experiment": experiment.model_dump_json(by_alias=True),
         "plugins": json.dumps(experiment.distributions()),
     }

@@ -22,7 +22,6 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from importlib.metadata import version
 from multiprocessing import active_children, get_context
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -41,6 +40,7 @@ from pbdkit.errors import (
     did_you_mean,
     warn_caller,
 )
+from pbdkit.hooks import pbdkit_version
 from pbdkit.io.layout import CONVENTIONS, SCHEMA_VERSION, Column
 from pbdkit.io.open import open as open_result
 from pbdkit.io.recorder import Recorder
@@ -466,7 +466,7 @@ def _attributes(plan: SweepPlan, versions: dict[str, str]) -> dict[str, str]:
         "Conventions": CONVENTIONS,
         "schema_version": SCHEMA_VERSION,
         "title": f"sweep of {experiment.name}",
-        "pbdkit_version": version("pbdkit"),
+        "pbdkit_version": pbdkit_version(),
         "sweep": json.dumps(sweep),
         "plugins": json.dumps({k: v for k, v in versions.items() if k != GIVEN}),
         "created": datetime.now(UTC).isoformat(timespec="seconds"),

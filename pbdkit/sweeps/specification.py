@@ -9,7 +9,6 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Set
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from itertools import combinations, product
 from math import prod
 from pathlib import Path
@@ -21,6 +20,7 @@ from pydantic import BeforeValidator, Field, ValidationError, model_validator
 
 from pbdkit.array_types import Array
 from pbdkit.errors import ExperimentError, PluginError, did_you_mean
+from pbdkit.hooks import pbdkit_version
 from pbdkit.io.layout import SCHEMA_VERSION, reserved_names
 from pbdkit.io.members import PARAMETER, STATUS, TEXT
 from pbdkit.io.physical import IN_MM
@@ -530,7 +530,7 @@ class SweepPlan:
         ExperimentError, PluginError
             If a member is invalid. The message contains the parameters of the member.
         """
-        installed, count = version("pbdkit"), self.sweep.count
+        installed, count = pbdkit_version(), self.sweep.count
         for n, (place, settings) in enumerate(places(grid)):
             show(n / count)
             with named(describe(settings)):

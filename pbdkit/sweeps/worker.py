@@ -13,7 +13,6 @@ import threading
 import time
 import warnings
 from collections.abc import Callable, Iterable
-from importlib.metadata import version
 from multiprocessing import parent_process
 from typing import Any, NamedTuple
 
@@ -23,7 +22,7 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from pbdkit.errors import ExperimentError, PbdkitError, PluginError
-from pbdkit.hooks import worded
+from pbdkit.hooks import pbdkit_version, worded
 from pbdkit.io.atomic_file import WHOLE
 from pbdkit.io.layout import Column, Values, When
 from pbdkit.io.physical import TWIN_OF
@@ -242,7 +241,7 @@ def _ran(
 
 def _refuse_other_versions(job: Job, experiment: Experiment) -> None:
     """Raise PluginError if a machine of a cluster has other versions than the sweep."""
-    installed = {"pbdkit": version("pbdkit")} | experiment.distributions()
+    installed = {"pbdkit": pbdkit_version()} | experiment.distributions()
     if installed != job.versions:
         differences = [
             f"{k} {installed.get(k)}, not {v}"
