@@ -132,7 +132,7 @@ def test_coarse_matrices_are_those_of_galerkin(kernels: Any, halved: Any, seed: 
 
 
 def beside_body(kind: Any, fine: Any, halved: Any) -> Any:
-    """Whether all coarse places around fine places are free."""
+    """Return whether all coarse places around fine places are free."""
     result = np.ones(len(fine), bool)
     for down in (0, 1):
         for along in (0, 1):

@@ -11,7 +11,7 @@ from scene_strategies import in_turn, samples
 import pbdkit
 from pbdkit.equilibrium.error_bound import DisplacementScale, EquilibriumPredictor
 from pbdkit.equilibrium.linearise import linearised
-from pbdkit.equilibrium.load_stepping import equilibrate, events, moments
+from pbdkit.equilibrium.load_stepping import _in_parts, equilibrate, events, moments
 from pbdkit.equilibrium.system import Moves
 from pbdkit.progress import Watch
 from pbdkit.scene.scene import build_scene
@@ -182,3 +182,11 @@ def test_first_order_bounds_are_doubled():
     way = float(np.hypot(*correction).max())
     assert found.error_bound.distance == pytest.approx(way + 2.0 * left, rel=1e-9)
     assert 2.0 * left > 1e-6 * way
+
+
+@pytest.mark.parametrize(
+    ("count", "lengths", "exact"),
+    [(6, [1.0, 2.0, 0.0], [2.0, 4.0, 0.0]), (6, [0.0, 0.0], [1.0, 1.0]), (1, [3.0], [1.0])],
+)
+def test_increments_are_proportional_to_the_path_of_the_leaders(count, lengths, exact) -> None:
+    assert _in_parts(count, lengths) == exact

@@ -412,8 +412,8 @@ class Coverage:
 
     def tests(self, mutant: Mutant, patience_s: float) -> tuple[list[str], list[str]]:
         """Return tests that execute the statement: those of the file that mirrors the source, and
-        the others. One case of each function comes before further cases, and the files take turns,
-        each with its cheapest test first, until the time is used up.
+        the others. The cheapest tests are taken until the time is used up, one case of each
+        function before further cases.
 
         If no test executes the statement, as in compiled functions and in headers of functions, all
         tests that execute any line of the file are taken.
@@ -428,18 +428,16 @@ class Coverage:
         ranked = []
         for name in sorted(names, key=lambda n: (self.cost[n], n)):
             if self.cost[name] < LONGEST_TEST_S:
-                file, function = name.split("::")[0], name.split("[")[0]
-                case, number = taken[function], taken[file]
+                function = name.split("[")[0]
+                ranked.append((taken[function], self.cost[name], name))
                 taken[function] += 1
-                taken[file] += case == 0
-                ranked.append((not file.startswith(mirror), case, number, self.cost[name], name))
         chosen: tuple[list[str], list[str]] = ([], [])
         total = 0.0
-        for away, *_, cost, name in sorted(ranked):
+        for _, cost, name in sorted(ranked):
             total += cost
             if total > patience_s and total > cost:
                 break
-            chosen[away].append(name)
+            chosen[not name.startswith(mirror)].append(name)
         return chosen
 
 
