@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.ndimage import label
 
+from pbdkit.equilibrium.multigrid import StencilGrid
 from pbdkit.equilibrium.stencil_matrix import (
     FREE,
     LED,
@@ -107,3 +109,25 @@ def test_axes_are_solved_one_after_the_other_if_one_leads(xy: float, yx: float) 
     matrix.stencils[..., 1] *= xy
     matrix.stencils[..., 2] *= yx
     assert leads_one_way(matrix) == (xy != yx)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_definite_diagonal_blocks_have_positive_eigenvalues(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    blocks = rng.normal(size=(3, 2, 2))
+    blocks = blocks @ blocks.swapaxes(1, 2) - rng.choice([0.0, 0.3]) * np.eye(2)
+    stencils = np.zeros((3, WINDOW, 4))
+    stencils[:, 4] = blocks.reshape(3, 4)
+    exact = bool((np.linalg.eigvalsh(blocks) > 0.0).all())
+    assert StencilGrid.is_definite_alone(SimpleNamespace(stencils=stencils)) == exact
+    negative = SimpleNamespace(stencils=-np.abs(stencils))
+    assert not StencilGrid.is_definite_alone(negative)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_the_matrix_of_a_grid_is_the_dense_one(seed: int) -> None:
+    matrix = random_matrix(seed)
+    grid = SimpleNamespace(code=matrix.code, stencils=matrix.stencils)
+    at, found = StencilGrid.matrix(grid)
+    np.testing.assert_array_equal(np.transpose(at), np.argwhere(matrix.code >= 0))
+    np.testing.assert_array_equal(found, dense(matrix))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pbdkit.identification.elastic_constants import Elasticity, elasticity
-from pbdkit.identification.identity import _range_text
+from pbdkit.identification.identity import _character, _range_text
 from pbdkit.identification.waves import DirectionalRange, _shortest, fourth_order
 
 VOIGT = np.array([[0, 2], [2, 1]])
@@ -87,3 +87,16 @@ def test_a_range_names_its_directions_unless_it_is_isotropic() -> None:
     assert _range_text(same, "h²") == "2 h² in every direction"
     wide = DirectionalRange(smallest=1.0, at_smallest=10.0, largest=2.0, at_largest=70.0)
     assert _range_text(wide, "h²") == "2 h² along 70°, 1 along 10°"
+
+
+@pytest.mark.parametrize("holds", [False, True])
+def test_properties_are_reported_as_they_are(holds: bool) -> None:
+    """Symmetry, linearity, invariance and rest."""
+    spectrum = SimpleNamespace(smallest=0.0, largest=2.0, imaginary=0.3 * holds)
+    identity: Any = SimpleNamespace(
+        spectrum=spectrum, linear=holds, symmetric=holds, turns=holds, rests_at_edges=holds
+    )
+    rows = dict(_character(identity))
+    assert rows.pop("eigenvalues") == "0 to 2" + ", imaginary parts up to 0.3" * holds
+    assert len(rows) == 4
+    assert all(text.startswith("yes" if holds else "no") for text in rows.values())
