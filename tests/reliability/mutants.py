@@ -412,8 +412,8 @@ class Coverage:
 
     def tests(self, mutant: Mutant, patience_s: float) -> tuple[list[str], list[str]]:
         """Return tests that execute the statement: those of the file that mirrors the source, and
-        the others. The cheapest tests are taken until the time is used up, one case of each
-        function before further cases.
+        the others. The cheapest tests are taken until the time is used up. The n-th case of a
+        function counts as n times as expensive.
 
         If no test executes the statement, as in compiled functions and in headers of functions, all
         tests that execute any line of the file are taken.
@@ -429,8 +429,8 @@ class Coverage:
         for name in sorted(names, key=lambda n: (self.cost[n], n)):
             if self.cost[name] < LONGEST_TEST_S:
                 function = name.split("[")[0]
-                ranked.append((taken[function], self.cost[name], name))
                 taken[function] += 1
+                ranked.append((self.cost[name] * taken[function], self.cost[name], name))
         chosen: tuple[list[str], list[str]] = ([], [])
         total = 0.0
         for _, cost, name in sorted(ranked):
