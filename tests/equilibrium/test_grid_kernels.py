@@ -180,6 +180,13 @@ def test_asymmetry_symmetric_part_and_balance(kernels: Any, seed: int) -> None:
     kernels.symmetrise(matrix.code, matrix.stencils)
     np.testing.assert_allclose(dense(matrix), (K + K.T) / 2, atol=1e-14)
     assert kernels.asymmetry(matrix.code, matrix.stencils) == 0.0
+    for row, place in np.argwhere(matrix.code >= 0):
+        for s in range(9):
+            if s != 4 and matrix.code[row + s // 3 - 1, place + s % 3 - 1] >= 0:
+                entry = matrix.stencils[matrix.code[row, place], s]
+                entry[s % 4] += 0.5
+                assert kernels.asymmetry(matrix.code, matrix.stencils) == pytest.approx(0.5)
+                entry[s % 4] -= 0.5
     share = np.random.default_rng(7).uniform(0.5, 2.0, matrix.code.shape)
     for row, place in np.argwhere(matrix.code >= 0):
         matrix.stencils[matrix.code[row, place]] /= share[row, place]
@@ -218,3 +225,7 @@ def test_vector_operations(kernels: Any) -> None:
     limit = np.sort(abs(entries).max(axis=1))[1]
     kernels.clear_noise(stencils, limit)
     assert np.count_nonzero(stencils.any(axis=(1, 2, 3))) == 1
+    single = np.zeros((4, 9, 2, 2))
+    single.reshape(4, 9, 4)[range(4), 2, range(4)] = -1.0
+    kernels.clear_noise(single, 0.9)
+    assert np.count_nonzero(single) == 4
