@@ -490,6 +490,9 @@ MAX_SETS = 60
 MIN_PART = 2.0**-6
 """Smallest fraction of a correction that is applied. Fractions are applied if the complete
 correction would separate particles from obstacles that hold them."""
+MAX_CYCLE_RATIO = 1e-3
+"""Corrections repeat themselves if the active set changes and the state is that of an earlier set,
+up to this fraction of the tolerance."""
 
 
 def follow_contact(finder: Finder, state: State, moment: float) -> ErrorBound:
@@ -517,13 +520,17 @@ class _ContactSearch(Search):
         shrink afterwards, or the result is not stable.
         """
         contacts, size, went_loose = None, math.inf, False
-        system = self._newest()
-        for _ in range(MAX_SETS):
+        system, earlier = self._newest(), self._state.u
+        for n in range(MAX_SETS):
             loose = system.is_loose(self._residual, self._rounding())
             if not loose and not self._finder.tolerance < self._distance() < math.inf:
                 break
             same = contacts is not None and np.array_equal(contacts, system.held)
             contacts = system.held
+            if n and not same and self._returned_to(earlier):
+                break
+            if n & (n - 1) == 0:  # at powers of two: finds cycles of any length (Brent, 1980)
+                earlier = self._state.u.copy()
             if loose:
                 went_loose = True
                 correction = system.solve_loose(self._residual, spacing_of(self._finder.scene))
@@ -549,6 +556,11 @@ class _ContactSearch(Search):
         if not system.is_stable():
             raise UnconvergedError(UNSTABLE, error_bound)
         return error_bound
+
+    def _returned_to(self, u: Floats) -> bool:
+        """Return whether the displacements are `u`, so that the sets since then follow again."""
+        change = self._finder.rows.max_norm(self._state.u - u)
+        return change <= MAX_CYCLE_RATIO * self._finder.tolerance
 
     def _go(self, correction: Floats) -> None:
         system = self._newest()

@@ -9,9 +9,20 @@ from hypothesis import given, strategies as st
 from scene_strategies import in_turn, samples
 
 import pbdkit
-from pbdkit.equilibrium.error_bound import DisplacementScale, EquilibriumPredictor
+from pbdkit.equilibrium.error_bound import (
+    DisplacementScale,
+    EquilibriumPredictor,
+    UnconvergedError,
+)
 from pbdkit.equilibrium.linearise import linearised
-from pbdkit.equilibrium.load_stepping import _in_parts, equilibrate, events, moments
+from pbdkit.equilibrium.load_stepping import (
+    _in_parts,
+    equilibrate,
+    events,
+    finder_of,
+    moments,
+)
+from pbdkit.equilibrium.newton import follow_contact
 from pbdkit.equilibrium.system import Moves
 from pbdkit.progress import Watch
 from pbdkit.scene.scene import build_scene
@@ -190,3 +201,24 @@ def test_first_order_bounds_are_doubled():
 )
 def test_increments_are_proportional_to_the_path_of_the_leaders(count, lengths, exact) -> None:
     assert _in_parts(count, lengths) == exact
+
+
+@pytest.mark.parametrize(("columns", "rise"), [(4, 1.2), (6, 1.0)])
+def test_an_active_set_that_recurs_ends_the_search(columns, rise):
+    """Particles that alternately touch and leave the obstacle would do so until the limit of 60
+    changes of the set, in each part of an increment."""
+    plane = {"half_plane": {"point": [0.0, 0.0], "normal": [0.0, 1.0]}}
+    motion = {"type": "displace", "displacement": [0.0, rise]}
+    experiment = springs(
+        [0.0, 0.0],
+        *(columns, 2),
+        lattice={"type": "square", "a": 1.0},
+        neighbours={"type": "chebyshev", "shells": 1},
+        leaders=[HOLD],
+        obstacles=[{"shape": plane, "motion": motion}],
+    )
+    scene = build_scene(pbdkit.Experiment(**experiment))
+    state = initial_state(scene)
+    with pytest.raises(UnconvergedError) as failed:
+        follow_contact(finder_of(scene, state), state, 1.0)
+    assert failed.value.error_bound.iterations < 30

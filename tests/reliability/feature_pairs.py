@@ -1,14 +1,16 @@
 """Run scenes in which any two features meet, and count the pairs of features that never do.
 
-    python tests/reliability/feature_pairs.py [--seed S] [--part N OF] [--law NAME ...] [--list]
+    python tests/reliability/feature_pairs.py [--seed S] [--scene N ...] [--law NAME ...] [--list]
 
 Features are the components, diagnostics and options that the schema of experiments contains, so
 that a new one is counted from the day on which it is registered. A pair has met if a scene with
 both was run and all laws of `scene_laws` that are about it held, the changes of units and the
 comparison of engines among them; it is refused if pbdkit reports the combination with the message
-that `crossed_scenes.REFUSALS` states. Scenes are drawn from the seed. What a refused scene leaves
-unmet is tried again in scenes with little besides. Prints each fault with the features and the
-experiment; exits with 1 if a law is broken, or if a pair neither met nor is refused.
+that `crossed_scenes.REFUSALS` states. Scenes are drawn from the seed, and each is run in a process
+of its own with bounded memory and processor time; a scene that is ended there counts as broken.
+What a refused scene leaves unmet is tried again in scenes with little besides. Prints each fault
+with the number, the features and the experiment of its scene; exits with 1 if a law is broken, or
+if a pair neither met nor is refused.
 """
 
 from __future__ import annotations
@@ -16,13 +18,17 @@ from __future__ import annotations
 import argparse
 import collections
 import json
+import multiprocessing
 import re
 import resource
 import signal
 import sys
 import traceback
+from contextlib import suppress
 from itertools import combinations
+from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import NamedTuple
 
 sys.path[:0] = [str(Path(__file__).parents[2]), str(Path(__file__).parent.parent)]
 
@@ -35,7 +41,7 @@ from crossed_scenes import (
     refused_pairs,
     refusing,
 )
-from experiment_features import Features, Pair
+from experiment_features import Features, Pair, Tree
 from scene_laws import LAWS, Faults
 
 import pbdkit
@@ -44,18 +50,66 @@ ENDS = "is loaded, but not constrained"
 """A part that comes off a torn body cannot rest: a scene may end in this message."""
 PATIENCE_S = 60
 """Processor time of one law on one scene."""
+MOST_S = 3 * PATIENCE_S
+"""Processor time of one scene, after which its process is ended even within a library."""
 MEMORY = 4 << 30
-"""Address space of the trial in bytes."""
+"""Address space of the process of a scene in bytes."""
 MOST_RETRIES = 400
 """Number of scenes with little besides one pair."""
+SLOWEST = 5
+"""Number of scenes of which the processor time is printed."""
 
 
 class TooLongError(Exception):
     """A law took more than its processor time."""
 
 
+class Outcome(NamedTuple):
+    """The faults that a law has found, or the message that refuses the scene."""
+
+    law: str
+    faults: Faults
+    refusal: str = ""
+
+
 def _interrupt(*_: object) -> None:
     raise TooLongError(f"not finished after {PATIENCE_S} s")
+
+
+def _test(tree: Tree, number: int, laws: list[str], results: Connection) -> None:
+    """Send the outcome of each law, until one of them refuses the scene."""
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+    resource.setrlimit(resource.RLIMIT_CPU, (MOST_S, MOST_S))
+    signal.signal(signal.SIGVTALRM, _interrupt)
+    for law in laws:
+        signal.setitimer(signal.ITIMER_VIRTUAL, PATIENCE_S)
+        try:
+            results.send(Outcome(law, LAWS[law](tree, number)))
+        except pbdkit.ExperimentError as error:
+            results.send(Outcome(law, [], str(error)))
+            return
+        except Exception:
+            results.send(Outcome(law, [traceback.format_exc(limit=-3)]))
+        finally:
+            signal.setitimer(signal.ITIMER_VIRTUAL, 0)
+
+
+def tested(tree: Tree, number: int, laws: list[str]) -> list[Outcome]:
+    """Return the outcomes of the laws on an experiment, from a process of its own."""
+    forked = multiprocessing.get_context("fork")
+    receiver, sender = forked.Pipe(duplex=False)
+    process = forked.Process(target=_test, args=(tree, number, laws, sender))
+    process.start()
+    sender.close()
+    outcomes: list[Outcome] = []
+    with suppress(EOFError):
+        while True:
+            outcomes.append(receiver.recv())
+    process.join()
+    if process.exitcode:
+        end = f"its process ended with {process.exitcode} (limits: {MOST_S} s, {MEMORY} bytes)"
+        outcomes.append(Outcome(laws[len(outcomes)], [end]))
+    return outcomes
 
 
 class Trial:
@@ -65,37 +119,37 @@ class Trial:
         self.laws = laws
         self.met: set[Pair] = set()
         self.outcomes: collections.Counter[str] = collections.Counter()
+        self.seconds: dict[int, float] = {}
         self.broken = 0
 
     def run(self, features: Features, number: int) -> None:
         """Test the laws on the scene of a set of features."""
-        tree = experiment_of(features, number)
-        faults: Faults = []
-        for law in self.laws:
-            signal.setitimer(signal.ITIMER_VIRTUAL, PATIENCE_S)
-            try:
-                found = LAWS[law](tree, number)
-            except pbdkit.ExperimentError as error:
-                self.outcomes[f"refused: {_shortened(error)}"] += 1
-                if ENDS not in str(error):
-                    print(number, sorted(features), f"refused: {error}", sep="\n    ", flush=True)
-                return
-            except Exception:
-                found = [traceback.format_exc(limit=-3)]
-            finally:
-                signal.setitimer(signal.ITIMER_VIRTUAL, 0)
-            self.outcomes[f"{law}: {'broken' if found else 'held'}"] += 1
-            faults += [f"{law}: {fault}" for fault in found]
+        tree, begun = experiment_of(features, number), _processor_time()
+        outcomes = tested(tree, number, self.laws)
+        self.seconds[number] = _processor_time() - begun
+        faults = [f"{one.law}: {fault}" for one in outcomes for fault in one.faults]
+        for law, found, refusal in outcomes:
+            word = "refused" if refusal else "broken" if found else "held"
+            self.outcomes[f"refused: {_shortened(refusal)}" if refusal else f"{law}: {word}"] += 1
+            if refusal and ENDS not in refusal:
+                faults.append(f"refused: {refusal}")
         if faults:
-            self.broken += 1
-            print(number, sorted(features), *faults, json.dumps(tree), sep="\n    ", flush=True)
-            return
-        having = CATALOGUE.of(experiment_from(tree))
-        self.met |= {frozenset(pair) for pair in combinations(having, 2)} & PAIRS
+            place = f"scene {number} ({self.seconds[number]:.0f} s)"
+            print(place, sorted(features), *faults, json.dumps(tree), sep="\n    ", flush=True)
+        self.broken += any(one.faults for one in outcomes)
+        if not any(one.faults or one.refusal for one in outcomes):
+            having = CATALOGUE.of(experiment_from(tree))
+            self.met |= {frozenset(pair) for pair in combinations(having, 2)} & PAIRS
 
 
-def _shortened(error: Exception) -> str:
-    return re.sub(r"\d[\d.e-]*", "#", str(error))[:90]
+def _processor_time() -> float:
+    """Return the processor time of the processes that have ended."""
+    times = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return times.ru_utime + times.ru_stime
+
+
+def _shortened(message: str) -> str:
+    return re.sub(r"\d[\d.e-]*", "#", message)[:90]
 
 
 def refused() -> tuple[set[Pair], int]:
@@ -115,33 +169,35 @@ def main() -> int:
     """Run the scenes and count the outcomes."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--part", type=int, nargs=2, metavar=("N", "OF"), default=(0, 1))
+    parser.add_argument("--scene", type=int, nargs="+", help="only the scenes with these numbers")
     parser.add_argument("--law", choices=LAWS, nargs="*", default=list(LAWS))
     parser.add_argument("--list", action="store_true", help="list the pairs that never meet")
     asked = parser.parse_args()
-    signal.signal(signal.SIGVTALRM, _interrupt)
-    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-    trial, (first, every) = Trial(asked.law), asked.part
-    scenes = list(covering(asked.seed))
-    for n in range(first, len(scenes), every):
-        trial.run(scenes[n], 1000 * asked.seed + n)
-    of_refusals, others = refused()
+    trial, scenes = Trial(asked.law), list(covering(asked.seed))
+    numbers = [1000 * asked.seed + n for n in range(len(scenes))]
+    for features, number in zip(scenes, numbers, strict=True):
+        if asked.scene is None or number in asked.scene:
+            trial.run(features, number)
+    of_refusals: set[Pair] = set()
     never: set[Pair] = set()
-    if every == 1:
+    others = 0
+    if asked.scene is None:
+        of_refusals, others = refused()
         never = PAIRS - trial.met - of_refusals
         for n, pair in enumerate(sorted(never, key=sorted)[:MOST_RETRIES]):
             if pair not in trial.met:
-                trial.run(pair, 1000 * asked.seed + len(scenes) + n)
+                trial.run(pair, numbers[-1] + 1 + n)
         never -= trial.met
     for what, times in sorted(trial.outcomes.items()):
         print(f"{what:32} {times}")
     if asked.list:
         print(*(" × ".join(sorted(pair)) for pair in sorted(never, key=sorted)), sep="\n")
-    print(f"{len(scenes)} scenes of seed {asked.seed}, {trial.broken} break a law")
+    slowest = sorted(trial.seconds.items(), key=lambda one: -one[1])[:SLOWEST]
+    print("slowest scenes:", ", ".join(f"{n} ({seconds:.0f} s)" for n, seconds in slowest))
+    print(f"{len(trial.seconds)} scenes of seed {asked.seed}, {trial.broken} break a law")
     print(f"{len(CATALOGUE.features)} features, {len(PAIRS)} pairs: {len(trial.met)} met, ", end="")
-    print(
-        f"{len(of_refusals)} refused, {f'{len(never)} never' if every == 1 else 'others not tried'}"
-    )
+    rest = "the others not tried" if asked.scene else f"{len(never)} never"
+    print(f"{len(of_refusals)} refused, {rest}")
     return int(bool(trial.broken or others or never))
 
 
