@@ -555,8 +555,14 @@ class StressStrain(Diagnostic):
             )
         u, v = (now.displacement(rows)[:, axis].mean() for rows in (start, end))
         group_position = now.reference(now.leader_groups()[self.group].rows)[:, axis].mean()
-        outwards = np.sign(group_position - (first + last) / 2)
-        pull = outwards * reactions(now)[self.group, axis]
+        outwards = group_position - (first + last) / 2
+        if abs(outwards) <= 1e-9 * max(abs(first), abs(last)):
+            raise ExperimentError(
+                f"leader group {self.group} is in the middle of the gauge along {self.axis}, at "
+                f"{group_position:g}, so that tension and compression cannot be distinguished; "
+                "choose points with the middle at one side of the group, or another group"
+            )
+        pull = np.sign(outwards) * reactions(now)[self.group, axis]
         return self.youngs_modulus * pull / self.width, (v - u) / (last - first)
 
     def _ends(self, now: Moment) -> tuple[Any, Any]:

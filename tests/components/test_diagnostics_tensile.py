@@ -141,6 +141,9 @@ def test_springs_start_at_youngs_modulus_and_deviate_in_proportion():
          "diagnostics.0: the gauge has both points and numbers; give only one of them"),
         ({"points": [[0, 0], [0, 1]]}, "diagnostics.0: the gauge has no length along x: both ends "
          "are at 0; choose points that differ along this axis"),
+        ({"axis": "y", "points": [[0, 0], [0, 2.5]]}, "diagnostics.0: leader group 1 is in the "
+         "middle of the gauge along y, at 1.25, so that tension and compression cannot be "
+         "distinguished; choose points with the middle at one side of the group, or another group"),
     ],
 )  # fmt: skip
 def test_scenes_without_a_curve_are_refused(wrong, message):
