@@ -331,8 +331,8 @@ def fits(features: Features) -> bool:
         if name and forms > len(NUMBERS.get(name, ())):
             return False
     in_time = any(f"{part} in time" in features for part in ("rule", "fracture", "solver"))
-    in_space = not features.isdisjoint({*FIELDS_OF_RULE, *FIELDS_OF_FRACTURE})
-    if "solver.engine: compiled" in features and in_time and in_space:
+    varies = not features.isdisjoint({*FIELDS_OF_RULE, *FIELDS_OF_FRACTURE, ANEW})
+    if "solver.engine: compiled" in features and in_time and varies:
         return False  # kernels have either
     if features >= {"solver in time", "solver.memory", "solver.relaxation"}:
         return False
@@ -853,8 +853,8 @@ class _Writer:
         by_leaders = not self.has("diagnostics.axis: y")
         by_leaders &= self.has("diagnostics.group") == self.has("diagnostics.against")
         by_leaders |= self.has("diagnostics.numbers")
-        # Its middle is not that of the body, where the edges that are pulled along y have theirs.
-        gauge = [self.at(0.2, 0.1), self.at(0.8, 0.6)]
+        # The middle of the gauge is below those of the edges, which are pulled along y.
+        gauge = [self.at(0.2, 0.1), self.at(0.8, 0.3)]
         written |= {"points": gauge} if self.has("diagnostics.points") or not by_leaders else {}
         written |= {"numbers": gauge} if self.has("diagnostics.numbers") else {}
         return written

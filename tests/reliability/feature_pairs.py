@@ -30,6 +30,13 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import NamedTuple
 
+import numba  # noqa: F401  # the processes of the scenes share all that is loaded
+import scipy.interpolate
+import scipy.optimize
+import scipy.sparse.linalg
+import scipy.spatial  # noqa: F401  # as above
+import xarray  # noqa: F401  # as above
+
 sys.path[:0] = [str(Path(__file__).parents[2]), str(Path(__file__).parent.parent)]
 
 from crossed_scenes import (
