@@ -22,7 +22,7 @@ from crossed_scenes import (
 from experiment_features import LEFT_OUT, Catalogue
 from scene_laws import LAWS
 
-from pbdkit import Diagnostic
+from pbdkit import Diagnostic, ExperimentError
 from pbdkit.plugin import Variable
 
 TRIALS = 21
@@ -82,6 +82,9 @@ def test_scenes_satisfy_the_laws(n):
     turn, law = divmod(n + TRIALS * DAY, len(LAWS))
     number = (turn + 37 * law) % len(scenes())
     name = list(LAWS)[law]
-    faults = LAWS[name](experiment_of(scenes()[number], number), number)
+    try:
+        faults = LAWS[name](experiment_of(scenes()[number], number), number)
+    except ExperimentError as error:  # for three features together; the script tries their pairs
+        pytest.skip(f"scene {number} is refused: {error}")
     repeat = f"python tests/reliability/feature_pairs.py --scene {number} --law {name}"
     assert not faults, (repeat, sorted(scenes()[number]), faults)
