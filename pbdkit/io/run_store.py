@@ -684,6 +684,8 @@ class UnfinishedRun:
         with suppress(OSError):  # The system may have kept the former name of the records, too.
             if os.path.samestat(self.records.stat(), os.fstat(self.disk.fileno())):
                 self.records.unlink()
+        with suppress(OSError):  # Otherwise a power cut could restore the store.
+            sync_folder(self.output.absolute().parent)
         self.disk.close()
         for path in (store_of(self.output), self.records):
             if path.exists():

@@ -495,6 +495,23 @@ def test_store_is_kept_if_the_name_of_the_result_cannot_be_synced(
     assert is_whole(right)
 
 
+def test_removal_of_the_store_outlasts_a_power_cut(
+    call: Any, often: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    settle, synced = os.fsync, [set[str]()]
+
+    def sync(descriptor: int) -> None:
+        settle(descriptor)
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            synced.append({path.name for path in Path.cwd().iterdir()})
+
+    stopped(call, monkeypatch)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", sync)
+        assert call("resume", str(OUT)).code == 0
+    assert synced[-1] == {"e.json", "out.nc"}
+
+
 @pytest.mark.parametrize("name", ["out.nc.run", "out.nc.run-records"])
 def test_file_of_a_finished_run_that_cannot_be_removed_is_named(
     call: Any, often: None, monkeypatch: pytest.MonkeyPatch, name: str

@@ -217,9 +217,18 @@ def _contents(folder: Folder, place: str, unseen: str) -> Iterator[tuple[str, by
 
 
 def _put(node: Folder, place: Path, entries_of: Any, content_of: Any) -> None:
-    place.mkdir(parents=True, exist_ok=True)
-    for name, entry in entries_of(node).items():
-        if isinstance(entry, Folder):
-            _put(entry, place / name, entries_of, content_of)
-        else:
-            (place / name).write_bytes(content_of(entry))
+    written: dict[int, Path] = {}
+
+    def put(node: Folder, place: Path) -> None:
+        place.mkdir(parents=True, exist_ok=True)
+        for name, entry in entries_of(node).items():
+            path = place / name
+            if isinstance(entry, Folder):
+                put(entry, path)
+            elif id(entry) in written:  # another name of the same file
+                path.hardlink_to(written[id(entry)])
+            else:
+                path.write_bytes(content_of(entry))
+                written[id(entry)] = path
+
+    put(node, place)
