@@ -29,7 +29,7 @@ TRIALS = 21
 """Number of trials of a law on a scene; `reliability/feature_pairs.py` makes all."""
 BEGIN = datetime.date(2026, 1, 1)
 DAY = 0 if os.environ.get("CI") else (datetime.date.today() - BEGIN).days
-"""Number of the day from which the trials are chosen; 0 under CI, where they are always the same."""
+"""Day that selects the trials; always 0 under CI."""
 scenes = cache(lambda: tuple(covering()))
 
 
