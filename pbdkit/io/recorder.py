@@ -48,7 +48,7 @@ class RecordedVariables:
         bonds_change = isinstance(experiment.fracture, RenewsBonds)
         particles_change = isinstance(experiment.rule, RenewsParticles)
         self._scene = scene
-        self._diagnostics = experiment.diagnostics
+        self._diagnostics = scene.diagnostics
         self.physical = Physical(experiment.units)
         numbers = [
             *((n, "bond", bonds_change) for n in bond_numbers(experiment)),

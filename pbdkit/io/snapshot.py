@@ -45,7 +45,7 @@ from pbdkit.plugin import (
     Vector,
     length,
 )
-from pbdkit.plugin.diagnostic import BondHistory, CellValues, ForceValues
+from pbdkit.plugin.diagnostic import BondHistory, CellTable, CellValues, ForceValues
 from pbdkit.plugin.discovery import errors_attributed_to
 from pbdkit.plugin.lattice import Side, area_share, corner_share, signed_area
 from pbdkit.plugin.rule import material_of
@@ -397,6 +397,41 @@ class StateCells(CellValues):
         if weighed is not None and weighed.phase is not None:
             whole = self._by_phase(weighed.phase, u, cells, whole)
         return read_only(whole.reshape(-1, 2, 2))
+
+    def table(self, near: tuple[Pair, float] | None = None) -> tuple[CellTable, ...]:
+        """Return the cells near a point, or the torn cells. Only their entries are created."""
+        tables = []
+        for patch in self._scene.patches:
+            chosen = patch.whole & ~self._intact(patch) if near is None else self._near(patch, near)
+            if chosen.any():
+                tables.append(self._table(patch, np.nonzero(chosen)))
+        return tuple(tables)
+
+    def _near(self, patch: Patch, near: tuple[Pair, float]) -> NDArray[np.bool_]:
+        (x, y), distance = near
+        origin = Vector(*self._scene.raster.lattice.origin[:2])
+        at = self._scene.raster.reference_planes(patch.corners[0]) + origin
+        return patch.whole & (abs(at.x - x) <= distance) & (abs(at.y - y) <= distance)
+
+    def _table(self, patch: Patch, at: tuple[Indices, ...]) -> CellTable:
+        """Return the cells of a patch at the given places."""
+        scene, state = self._scene, self._state
+        starts = [(block.sublattice, block.start) for block in patch.corners]
+        rows = [
+            scene.raster.rows_at(s, *(n + first for n, first in zip(at, start, strict=True)))
+            for s, start in starts
+        ]
+        share = np.broadcast_to(scene.cells.of(patch) if scene.cells else 1.0, patch.whole.shape)
+        pairs, broken = [], []
+        for block, slot in patch.bonds(scene.neighbourhood.slots):
+            plane, at_this_end = scene.neighbourhood.owner[slot]
+            owner = block if at_this_end else block.seen_through(slot)
+            pairs.append([patch.corners.index(b) for b in (block, block.seen_through(slot))])
+            steps = None if state.broken_step is None else owner.within(state.broken_step[plane])
+            broken.append(np.zeros(len(at[0]), bool) if steps is None else steps[at] >= 0)
+        bonds = np.array(pairs, np.intp).reshape(-1, 2)
+        flags = np.array(broken, bool).reshape(len(bonds), len(at[0])).T
+        return CellTable(np.stack(rows, axis=1), share[at], bonds, flags)
 
     def lost_stress(self) -> Floats | None:
         """Return the stress that is lost because of damage. It is computed at each call, because

@@ -34,7 +34,9 @@ from pbdkit.plugin.component import (
 )
 from pbdkit.plugin.diagnostic import (
     BondHistory,
+    CellTable,
     CellValues,
+    CrackEnd,
     Diagnostic,
     ForceValues,
     LeaderRows,
@@ -121,7 +123,8 @@ BUILTIN = GROUP
 __all__ = [
     "AREA", "ENERGY", "FORCE", "FRACTURE_ENERGY", "LENGTH", "STRESS", "Anchors", "AppliesTwice",
     "Axes", "BasisSite", "BondHistory", "Bonds", "BreaksAtStrain", "Calibrated", "Cell",
-    "CellPolygon", "CellStress", "CellValues", "Command", "Component", "Condition", "Constants",
+    "CellPolygon", "CellStress", "CellTable", "CellValues", "Command", "Component", "Condition",
+    "Constants", "CrackEnd",
     "Diagnostic", "Drawn", "Draws", "FollowerRule", "ForceValues", "FractureModel", "FrameMap",
     "FramePolicy", "FrameSites", "Here", "Lattice", "LeaderRows", "LoadRows", "Loadable",
     "MixesCells", "Moment", "Nearness", "NeighbourMetric", "Number", "Numbers", "Offset", "Pair",

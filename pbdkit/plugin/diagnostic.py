@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal, NamedTuple, cast
+from typing import Any, ClassVar, Literal, NamedTuple, Self, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from pbdkit.array_types import Floats
 from pbdkit.plugin.component import Bonds, Component, Pair
 from pbdkit.plugin.rule import Stiffness
 
-Need = Literal["bonds", "cells", "material", "forces", "loads"]
+Need = Literal["bonds", "cells", "cracks", "material", "forces", "loads"]
 """Type of the names of data that a diagnostic can require."""
 
 
@@ -35,6 +35,8 @@ class Variable:
         Data type.
     attributes : dict
         Further attributes.
+    may_be_nan : bool
+        Whether NaN is allowed anywhere, for quantities that are not always defined.
     """
 
     name: str
@@ -43,6 +45,7 @@ class Variable:
     units: str
     dtype: str = "f8"
     attributes: dict[str, Any] = field(default_factory=dict)
+    may_be_nan: bool = False
 
     def __post_init__(self) -> None:
         if isinstance(cast(Any, self.dims), str):
@@ -52,7 +55,7 @@ class Variable:
         """Return a mask of the values that are allowed in the dataset.
 
         All finite values are allowed, and NaN at particles outside the outline, such as frame
-        points.
+        points. NaN is allowed everywhere if the variable has `may_be_nan`.
 
         Parameters
         ----------
@@ -67,6 +70,8 @@ class Variable:
             Mask, in the shape of `values`.
         """
         allowed: NDArray[np.bool_] = np.isfinite(values)
+        if self.may_be_nan:
+            return allowed | np.isnan(values)
         if "particle" in self.dims:
             shape = [-1 if dim == "particle" else 1 for dim in self.dims]
             allowed |= np.isnan(values) & ~inside.reshape(shape)
@@ -122,6 +127,48 @@ class TouchingRows(NamedTuple):
 
     rows: NDArray[np.intp]
     normals: Floats
+
+
+class CrackEnd(NamedTuple):
+    """End of a cut, or of an initial crack, inside the body.
+
+    Parameters
+    ----------
+    place : tuple of float
+        Position in lattice units.
+    direction : tuple of float
+        Unit vector from the crack into the uncracked body.
+    """
+
+    place: Pair
+    direction: Pair
+
+
+@dataclass(frozen=True)
+class CellTable:
+    """Cells of one shape, with one row for each cell.
+
+    Parameters
+    ----------
+    corners : array of int, shape (cell, corner)
+        Rows of the corners in the tables of `Moment`, counterclockwise.
+    share : array of float, shape (cell,)
+        Area fraction of each cell inside the outline.
+    bonds : array of int, shape (bond, 2)
+        Corners between which each cell has a bond.
+    broken : array of bool, shape (cell, bond)
+        Whether the bond is broken.
+    """
+
+    corners: NDArray[np.intp]
+    share: Floats
+    bonds: NDArray[np.intp]
+    broken: NDArray[np.bool_]
+
+    @property
+    def torn(self) -> NDArray[np.bool_]:
+        """Whether a bond of the cell is broken, (cell,)."""
+        return np.asarray(self.broken.any(axis=1))
 
 
 @dataclass(frozen=True)
@@ -196,6 +243,22 @@ class CellValues(ABC):
         The gradient is the mean over the cells at the particle, weighted by their area fractions
         inside the outline. It is extrapolated from the common centre of these cells to the
         particle. Cells with a broken bond between two of their corners are excluded.
+        """
+
+    @abstractmethod
+    def table(self, near: tuple[Pair, float] | None = None) -> tuple[CellTable, ...]:
+        """Return some of the cells of which all corners belong to the body.
+
+        Parameters
+        ----------
+        near : tuple of (point, float), optional
+            Point and distance in lattice units: the cells are those of which the first corner is at
+            most so far from the point along each axis. By default they are the torn cells.
+
+        Returns
+        -------
+        tuple of CellTable
+            One table for each shape of cells in each part of the body.
         """
 
     def lost_stress(self) -> Floats | None:
@@ -466,6 +529,7 @@ class Diagnostic(Component):
 
     - "bonds": the table of bonds in the dataset.
     - "cells": `Moment.cells`. A body without cells, such as a single row, is an error.
+    - "cracks": cuts or initial cracks that end inside the body, which `at_cracks` receives.
     - "material": `Moment.forces.stiffness`. A rule that is not calibrated is an error.
     - "forces": all of `Moment.forces`. A rule that is not calibrated is an error.
     - "loads": `Moment.loads`. An experiment without loads is an error. Variables can then have the
@@ -512,6 +576,28 @@ class Diagnostic(Component):
             Coordinates by the name of the dimension.
         """
         return {}
+
+    def at_cracks(self, ends: tuple[CrackEnd, ...]) -> Self:
+        """Return the diagnostic for a scene with cracks; by default it does not depend on them.
+
+        It is called for diagnostics with "cracks" in `needs`, before `coordinates`.
+
+        Parameters
+        ----------
+        ends : tuple of CrackEnd
+            Ends of the cuts and initial cracks inside the body.
+
+        Returns
+        -------
+        Diagnostic
+            Diagnostic that is measured in the scene.
+
+        Raises
+        ------
+        ExperimentError
+            If the diagnostic requires cracks, and the scene has none.
+        """
+        return self
 
     def check(self, particles: int, leader_groups: int) -> None:
         """Check that the diagnostic is compatible with the scene.

@@ -55,7 +55,7 @@ class Quantity:
         unit" the unit of the thickness.
     unit : str
         Unit in terms of mm and MPa.
-    length, youngs_modulus, thickness : int
+    length, youngs_modulus, thickness : float
         Exponents.
     also : Quantity, optional
         Second quantity that is accepted. For example, a fracture energy can also be given as a
@@ -65,7 +65,7 @@ class Quantity:
     meaning: str
     lattice: str
     unit: str
-    length: int = 0
+    length: float = 0
     youngs_modulus: int = 0
     thickness: int = 0
     also: Quantity | None = None
@@ -121,12 +121,20 @@ FRACTURE_ENERGY = Quantity(
     length=1, youngs_modulus=1, also=LENGTH,
 )  # fmt: skip
 """Quantity of an energy per area, in N/mm. Divided by Young's modulus it is a length."""
+STRESS_INTENSITY = Quantity(
+    "stress intensity factor", "stress unit * lattice unit^0.5", "MPa*mm^0.5",
+    length=0.5, youngs_modulus=1,
+)  # fmt: skip
+"""Quantity of a stress intensity factor, in MPa √mm."""
 BODY_FORCE = Quantity(
     "force per area", "stress unit * thickness unit / lattice unit", "N/mm^2",
     length=-1, youngs_modulus=1, thickness=1,
 )  # fmt: skip
 """Quantity of a force per area, in N/mm²."""
-QUANTITIES = {q.lattice: q for q in (LENGTH, AREA, STRESS, FORCE, ENERGY, BODY_FORCE)}
+QUANTITIES = {
+    q.lattice: q
+    for q in (LENGTH, AREA, STRESS, FORCE, ENERGY, FRACTURE_ENERGY, STRESS_INTENSITY, BODY_FORCE)
+}
 """Quantities by their unit in datasets."""
 
 Place = Annotated[tuple[Annotated[float, LENGTH], Annotated[float, LENGTH]], Field(strict=False)]

@@ -39,19 +39,19 @@ from pbdkit.model.bodies import Difference
 from pbdkit.model.experiment import Experiment
 from pbdkit.plugin import (
     AppliesTwice,
+    Diagnostic,
     MixesCells,
     Remembers,
     Setting,
-    StartsCracked,
     TearsCells,
     Vector,
 )
 from pbdkit.plugin.discovery import errors_attributed_to
-from pbdkit.plugin.fracture_model import Segment
 from pbdkit.plugin.lattice import Index
 from pbdkit.plugin.schedule import TimeDependent
 from pbdkit.scene import checks
 from pbdkit.scene.constants import SceneConstants, check_diagnostics, scene_constants, with_fields
+from pbdkit.scene.crack_ends import diagnostics_at_cracks, segments_of
 from pbdkit.scene.frame import Frame, build_frame
 from pbdkit.scene.leader_groups import Leading, build_leading, check_directions
 from pbdkit.scene.loads import Loads, build_loads
@@ -220,6 +220,8 @@ class Scene:
         Obstacles.
     operations
         Operations of particles.
+    diagnostics
+        Diagnostics as they are measured.
     """
 
     experiment: Experiment
@@ -236,6 +238,7 @@ class Scene:
     warnings: tuple[str, ...]
     barriers: tuple[Barrier, ...] = ()
     operations: tuple[Operated, ...] = ()
+    diagnostics: tuple[Diagnostic, ...] = ()
 
     @property
     def driven(self) -> tuple[Leading | Barrier, ...]:
@@ -389,7 +392,8 @@ def _build(experiment: Experiment, ground: LatticeSetup) -> Scene:
     warnings += [*checks.angles_in_radians(experiment), *checks.locking(experiment, raster, box)]
     warnings += checks.coarse_arcs(experiment, raster)
     warnings += checks.narrow_voids(experiment.lattice, ground.left_out)
-    warnings += missing_segments(raster, neighbourhood, _segments(experiment))
+    segments = {name: part.segment for name, part in segments_of(experiment).items()}
+    warnings += missing_segments(raster, neighbourhood, segments)
     setting = setting_of(raster, neighbourhood, box)
     constants = scene_constants(experiment, setting)
     constants = with_fields(constants, experiment, raster, neighbourhood, setting)
@@ -413,17 +417,8 @@ def _build(experiment: Experiment, ground: LatticeSetup) -> Scene:
     lower, upper = box
     facts = loads, setting, (lower + upper) / 2
     operations = build_operations(raster, experiment)
-    return with_inner(Scene(experiment, *parts, *facts, tuple(warnings), barriers, operations))
-
-
-def _segments(experiment: Experiment) -> dict[str, Segment]:
-    """Return the segments of the cuts and of the initial cracks, by their fields in the
-    experiment."""
-    segments = {f"cuts.{n}": cut.segment for n, cut in enumerate(experiment.cuts)}
-    if isinstance(model := experiment.fracture, StartsCracked):
-        with errors_attributed_to(model, "to return its cracks", "fracture"):
-            segments |= {f"fracture.cracks.{n}": s for n, s in enumerate(model.segments())}
-    return segments
+    more = tuple(warnings), barriers, operations, diagnostics_at_cracks(experiment)
+    return with_inner(Scene(experiment, *parts, *facts, *more))
 
 
 def renumbered(scene: Scene, experiment: Experiment) -> Scene:

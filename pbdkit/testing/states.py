@@ -261,6 +261,8 @@ class Shown:
             return tuple(group._replace(rows=place[group.rows]) for group in value)
         if name == "loads":
             return tuple(load._replace(rows=place[load.rows]) for load in value)
+        if name == "table":
+            return tuple(replace(part, corners=place[part.corners]) for part in value)
         if name == "touching":
             return tuple(TouchingRows(place[contact.rows], contact.normals) for contact in value)
         in_order = name in self.OF_PARTICLES and len(value) == len(place)
