@@ -31,7 +31,7 @@ DOMAINS = (0.6, 0.7, 0.8, 0.9, 1.0)
 """Outer radii of the domains, relative to the largest one."""
 HOLLOW = 0.5
 """Inner radius of a domain, relative to its outer radius."""
-MAX_CELLS = 24.0
+MAX_CELLS = 40.0
 """Default of the largest radius, in sides of a cell."""
 MIN_CELLS = 6.0
 """Radius below which no domain is used, in sides of a cell."""
@@ -40,7 +40,7 @@ BESIDE = 1.25
 SEARCHED = 2.5
 """Distance along a crack within which its last torn cells are searched, in sides of a cell."""
 STEPS_BACK = 8
-"""Number of torn cells over which the direction of a crack that has grown is determined."""
+"""Number of torn cells from which the line of a crack that has grown is determined."""
 LARGE_STRAIN = 0.1
 """Displacement gradients above this number are not small."""
 ISOTROPY_RTOL = 1e-9
@@ -147,7 +147,8 @@ def auxiliary(x: Floats, material: IsotropicPlane) -> tuple[Floats, Floats]:
     along, around = np.moveaxis(along, 0, -1), np.moveaxis(around, 0, -1)
 
     def gradient(du_dr: Floats, du_da: Floats) -> Floats:
-        return du_dr[..., None] * radial[..., None, :] + du_da[..., None] * turned[..., None, :]
+        parts = (du_dr, radial), (du_da, turned)
+        return np.asarray(sum(u[..., None] * unit[..., None, :] for u, unit in parts))
 
     williams = gradient(values / 2 / root, slopes / root)
     point = gradient(along / r[..., None], around / r[..., None])
@@ -423,6 +424,8 @@ class Cracks:
         if self.size:
             places = [places_of(now, table) for table in tables]
             self._centres = np.concatenate([corners.mean(axis=1) for corners in places])
+            ends = [x[:, t.bonds][t.broken] for x, t in zip(places, tables, strict=True)]
+            self._broken = np.concatenate(ends)
             self._corners = [row for table in tables for row in table.corners.tolist()]
             self.side = side_of(places[0][0])
             """Length of the longest side of a cell."""
@@ -441,13 +444,25 @@ class Cracks:
             return None
         last = int(near[np.lexsort((abs(across[near]), -along[near]))[0]])
         path = self._grown(last, ~(is_beside & (along <= along[last])), along)
-        if len(path) == 1:
-            return self._before_intact_bond(start, along[last] * self.side)
-        back = self._centres[path[-min(len(path), STEPS_BACK + 1)]]
-        ahead = self._centres[path[-1]] - back
-        return self._before_intact_bond(
-            Frame(self._centres[path[-1]], ahead / math.hypot(*ahead)), 0.0
-        )
+        line, length = start, MAX_CELLS
+        if len(path) > 1:
+            length = min(len(path) - 1, STEPS_BACK)
+            ahead = self._centres[path[-1]] - self._centres[path[-1 - length]]
+            line = Frame(self._centres[path[-1]], ahead / math.hypot(*ahead))
+        along, across = line.of(self._centres[path[-1]])
+        at = line.origin + along * line.direction
+        return self._before_intact_bond(self._between_lips(Frame(at, line.direction), length))
+
+    def _between_lips(self, line: Frame, length: float) -> Frame:
+        """Return a line midway between the lips of the crack, along a number of cells behind its
+        origin.
+        """
+        x = line.of(self._broken) / self.side
+        middle = x.mean(axis=1)
+        own = (abs(middle[:, 1]) <= BESIDE) & (-length <= middle[:, 0]) & (middle[:, 0] <= 1.0)
+        low, high = np.sort(x[own, :, 1], axis=1).T
+        shift = self.side * (low.max() + high.min()) / 2
+        return Frame(line.origin + shift * line.axes[1], line.direction)
 
     def _grown(self, first: int, allowed: NDArray[np.bool_], along: Floats) -> list[int]:
         """Return the longest chain of torn cells that begins with a cell; consecutive cells share a
@@ -471,23 +486,22 @@ class Cracks:
             path.append(previous[path[-1]])
         return path[::-1]
 
-    def _before_intact_bond(self, line: Frame, last: float) -> Frame:
+    def _before_intact_bond(self, line: Frame) -> Frame:
         """Return the frame with the tip where the first intact bond ahead of broken ones crosses
-        the line; `last` is the position of the last torn cell along it.
+        the line, of which the origin is beside the last torn cell.
 
         Bonds of which no spring would remain in a torn cell carry nothing across the crack.
         """
-        at = line.origin + last * line.direction
-        c = stiffness_at(self._now, at)
-        intact, broken = [], [last - SEARCHED * self.side]
-        for table in self._now.cells.table(((float(at[0]), float(at[1])), 2 * SEARCHED * self.side)):
+        x, y = line.origin.tolist()
+        c = stiffness_at(self._now, line.origin)
+        intact, broken = [], [-SEARCHED * self.side]
+        for table in self._now.cells.table(((x, y), 2 * SEARCHED * self.side)):
             x = line.of(places_of(self._now, table))
             a, b = x[:, table.bonds[:, 0]], x[:, table.bonds[:, 1]]
-            limit = -ON_LINE * self.side
-            crosses = (a[..., 1] >= limit) != (b[..., 1] >= limit)
+            crosses = (a[..., 1] >= 0.0) != (b[..., 1] >= 0.0)
             height = np.where(crosses, b[..., 1] - a[..., 1], 1.0)
             place = a[..., 0] - a[..., 1] * (b[..., 0] - a[..., 0]) / height
-            crosses &= abs(place - last) <= SEARCHED * self.side
+            crosses &= abs(place) <= SEARCHED * self.side
             carries = springs_of(c, places_of(self._now, table)[0], table.bonds) > 0.0
             intact.append(place[crosses & ~table.broken & carries])
             broken.extend(place[crosses & table.broken].tolist())
@@ -661,7 +675,11 @@ def turned(c: Stiffness, axes: Floats) -> Stiffness:
     # Rows: the strains xx, yy and γ in the axes of the lattice, for each of the other axes.
     T = np.array([[x[0] ** 2, x[1] ** 2, x[0] * x[1]], [y[0] ** 2, y[1] ** 2, y[0] * y[1]],
                   [2 * x[0] * y[0], 2 * x[1] * y[1], x[0] * y[1] + x[1] * y[0]]])  # fmt: skip
-    C = T.T @ [[c.xx, c.xy, c.x_shear], [c.xy, c.yy, c.y_shear], [c.x_shear, c.y_shear, c.shear]] @ T
+    C = (
+        T.T
+        @ [[c.xx, c.xy, c.x_shear], [c.xy, c.yy, c.y_shear], [c.x_shear, c.y_shear, c.shear]]
+        @ T
+    )
     return Stiffness(C[0, 0], C[1, 1], C[0, 1], C[2, 2], C[0, 2], C[1, 2])
 
 

@@ -411,7 +411,7 @@ class StateCells(CellValues):
         (x, y), distance = near
         origin = Vector(*self._scene.raster.lattice.origin[:2])
         at = self._scene.raster.reference_planes(patch.corners[0]) + origin
-        return patch.whole & (abs(at.x - x) <= distance) & (abs(at.y - y) <= distance)
+        return np.asarray(patch.whole & (abs(at.x - x) <= distance) & (abs(at.y - y) <= distance))
 
     def _table(self, patch: Patch, at: tuple[Indices, ...]) -> CellTable:
         """Return the cells of a patch at the given places."""

@@ -71,7 +71,7 @@ class Variable:
         """
         allowed: NDArray[np.bool_] = np.isfinite(values)
         if self.may_be_nan:
-            return allowed | np.isnan(values)
+            allowed |= np.isnan(values)
         if "particle" in self.dims:
             shape = [-1 if dim == "particle" else 1 for dim in self.dims]
             allowed |= np.isnan(values) & ~inside.reshape(shape)

@@ -72,7 +72,9 @@ def _is_inside(experiment: Experiment, point: Pair, near: float) -> bool:
     around = np.stack(np.meshgrid([-2, -1, 0, 1, 2, 3], [-2, -1, 0, 1, 2, 3]), axis=-1)
     for site in cell.sites:
         corner = np.add(lattice.origin, [*site.at])
-        nearest = np.linalg.solve(np.array([[*v] for v in cell.vectors]).T, np.array(point) - corner)
+        nearest = np.linalg.solve(
+            np.array([[*v] for v in cell.vectors]).T, np.array(point) - corner
+        )
         cells = np.floor(nearest).astype(np.int64) + around.reshape(-1, 2)
         at = cells @ np.array([[*v] for v in cell.vectors]) + corner
         close = np.hypot(*(at - point).T) <= near

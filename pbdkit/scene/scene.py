@@ -417,8 +417,8 @@ def _build(experiment: Experiment, ground: LatticeSetup) -> Scene:
     lower, upper = box
     facts = loads, setting, (lower + upper) / 2
     operations = build_operations(raster, experiment)
-    more = tuple(warnings), barriers, operations, diagnostics_at_cracks(experiment)
-    return with_inner(Scene(experiment, *parts, *facts, *more))
+    measured = operations, diagnostics_at_cracks(experiment)
+    return with_inner(Scene(experiment, *parts, *facts, tuple(warnings), barriers, *measured))
 
 
 def renumbered(scene: Scene, experiment: Experiment) -> Scene:

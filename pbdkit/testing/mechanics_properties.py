@@ -106,7 +106,7 @@ def _scaled(part: Component) -> Component:
     return type(part).model_validate(parameters)
 
 
-def _lengths(part: Component) -> dict[str, int]:
+def _lengths(part: Component) -> dict[str, float]:
     """Return the parameters that are powers of lengths, with the power; the origin is excluded."""
     lengths = {}
     for name, field in type(part).model_fields.items():
