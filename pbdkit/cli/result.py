@@ -15,7 +15,7 @@ import numpy as np
 from pbdkit.cli.output import refuse_output
 from pbdkit.errors import ExperimentError, PbdkitError, StorageError
 from pbdkit.io import vtkhdf
-from pbdkit.io.explain import PLACES, BondRecords, BondStatus
+from pbdkit.io.explain import PLACES, BondRecords, BondStatus, TipStatus, tip_statuses
 from pbdkit.io.layout import scene_of
 from pbdkit.io.open import reading
 from pbdkit.io.other_files import refuse_other_file
@@ -32,14 +32,19 @@ MAX_LISTED = 20
 def explain(file: Path, bond: tuple[int, int] | None, at: dict[str, str], as_json: bool) -> None:
     """Explain fracture: which bonds broke, when, at which strain and in which order.
 
+    With the diagnostic stress-intensity, also report how close each crack is to growing.
+
     For one bond, report how close it is to breaking or how it broke, and what happened around
     it.
     """
     with waiting(f"reading {file}", silent=as_json), reading(file, at=at) as dataset:
-        explained = BondRecords(dataset, scene_of(dataset, "explain"))
+        scene = scene_of(dataset, "explain")
+        explained = BondRecords(dataset, scene)
         facts = _bond_facts(explained, *bond) if bond else _run_facts(explained)
+        if not bond:
+            facts["crack_tips"] = tip_statuses(dataset, scene.experiment)
         lines = _bond_in_words(facts) if bond else _run_in_words(facts)
-        text = json.dumps(facts, default=asdict) if as_json else "\n".join(lines)
+        text = json.dumps(facts, default=_as_dict) if as_json else "\n".join(lines)
     click.echo(text)
 
 
@@ -101,6 +106,28 @@ def _run_in_words(facts: dict[str, Any]) -> Iterator[str]:
     if facts["nearest"]:
         nearest = facts["nearest"]
         yield f"nearest to breaking: {_name(nearest)}: {_describe_status(nearest)}"
+    yield from map(_tip_in_words, facts["crack_tips"])
+
+
+def _tip_in_words(tip: TipStatus) -> str:
+    """Describe a crack tip, and how far its crack is from growing."""
+    x, y = tip.place
+    name = f"crack tip {tip.tip} at ({x:.6g}, {y:.6g}) in step {tip.at_step}"
+    if tip.release is None:
+        return f"{name}: no energy release rate, because there is no crack or no space around it"
+    words = f"{name}: energy release rate {tip.release:.6g} {tip.units}"
+    if tip.critical is None or tip.share is None:
+        return f"{words}; the fracture model has no critical energy release rate"
+    words += f", {tip.share:.3g} of the critical one, {tip.critical:.6g}"
+    if tip.load_factor is None:
+        return words
+    return f"{words}; the crack grows at {tip.load_factor:.4g} times the load"
+
+
+def _as_dict(status: Any) -> dict[str, Any]:
+    """Return a status as a dictionary; that of a tip contains its ratios too."""
+    ratios = {"share": status.share} if isinstance(status, TipStatus) else {}
+    return asdict(status) | ratios | ({"load_factor": status.load_factor} if ratios else {})
 
 
 def _bond_in_words(facts: dict[str, Any]) -> Iterator[str]:

@@ -460,6 +460,9 @@ class Cracks:
         x = line.of(self._broken) / self.side
         middle = x.mean(axis=1)
         own = (abs(middle[:, 1]) <= BESIDE) & (-length <= middle[:, 0]) & (middle[:, 0] <= 1.0)
+        own &= abs(x[:, 1, 1] - x[:, 0, 1]) > ON_LINE  # Without bonds along the crack.
+        if not own.any():
+            return line
         low, high = np.sort(x[own, :, 1], axis=1).T
         shift = self.side * (low.max() + high.min()) / 2
         return Frame(line.origin + shift * line.axes[1], line.direction)

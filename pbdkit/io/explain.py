@@ -12,11 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.array_types import Floats
+from pbdkit.components.fracture import Cohesive
+from pbdkit.components.stress_intensity import StressIntensity
 from pbdkit.errors import ExperimentError, StorageError
 from pbdkit.io.layout import OF_FRAME, as_step
 from pbdkit.lattice.raster import Places
+from pbdkit.model.experiment import Experiment
 from pbdkit.plugin import Bonds, BreaksAtStrain, FractureModel
 from pbdkit.plugin.fracture_model import breaking_order
+from pbdkit.plugin.units import FRACTURE_ENERGY
 from pbdkit.scene.constants import bond_numbers
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import describe_bonds
@@ -59,6 +63,58 @@ class BondStatus:
     def share(self) -> float | None:
         """Strain at `at_step` divided by the breaking strain. The bond breaks when it reaches 1."""
         return self.strain / self.breaks_above if self.breaks_above else None
+
+
+@dataclass(frozen=True)
+class TipStatus:
+    """Status of a crack tip at the last recorded step, in the units of the dataset.
+
+    `release` is the energy release rate, and `critical` the fracture energy of the fracture model;
+    they are None if they are unknown.
+    """
+
+    tip: int
+    place: tuple[float, float]
+    at_step: float
+    K_I: float | None
+    K_II: float | None
+    release: float | None
+    critical: float | None
+    units: str
+
+    @property
+    def share(self) -> float | None:
+        """Energy release rate divided by its critical value; the crack grows when it reaches 1."""
+        return self.release / self.critical if self.critical and self.release is not None else None
+
+    @property
+    def load_factor(self) -> float | None:
+        """Factor by which the load of a linear body must be multiplied until the crack grows."""
+        return self.share**-0.5 if self.share else None
+
+
+def tip_statuses(dataset: xarray.Dataset, experiment: Experiment) -> list[TipStatus]:
+    """Return the status of each crack tip; empty if the run has no `stress-intensity`."""
+    parts = [d for d in experiment.diagnostics if isinstance(d, StressIntensity)]
+    names = ("K_I", "K_II", "G", "J")
+    if not parts or not {*names, "crack_tip_position"} <= {*dataset.variables}:
+        return []
+    last = dataset.isel(time=-1)
+    model, units = experiment.fracture, str(last["J"].attrs["units"])
+    critical = None
+    if isinstance(model, Cohesive) and "energy" not in model.varying:
+        critical = parts[0].youngs_modulus * model.energy
+        if experiment.units and units == FRACTURE_ENERGY.unit:
+            critical *= experiment.units.length_mm
+    rows = np.stack([np.asarray(last[name].values, float) for name in names], axis=1)
+    places = last["crack_tip_position"].values.tolist()
+    return [
+        TipStatus(
+            n, (x, y), as_step(last["time"].values), _known(K_I), _known(K_II),
+            _known(J if np.isnan(G) else G), critical, units,
+        )
+        for n, ((K_I, K_II, G, J), (x, y)) in enumerate(zip(rows.tolist(), places, strict=True))
+    ]  # fmt: skip
 
 
 class BondRecords:

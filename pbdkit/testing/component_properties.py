@@ -300,24 +300,29 @@ def _sites(offsets: Iterable[Offset]) -> set[tuple[int, ...]]:
 
 
 NAME = r"[a-z][a-z0-9_]*"
-"""Pattern of the name of a variable."""
+"""Pattern of the name of a state variable."""
+SYMBOLIC_NAME = r"(?:[a-z][a-z0-9]*|[A-Z])(?:_(?:[a-z0-9]*|[A-Z]|I{2,3}))*"
+"""Pattern of the name of a variable of a diagnostic: words in lower case, or symbols of one letter
+and Roman numerals, as in `K_II`."""
 
 
 @property_of(Diagnostic)
 def labels_its_variables(subject: Subject) -> None:
-    """Every variable has a name in lower case that the dataset does not reserve, a long name, and
-    units ("1" if it has none): the dataset can be read without the program."""
+    """Every variable has a name in lower case, apart from symbols such as `K_I`, that the dataset
+    does not reserve, a long name, and units ("1" if it has none): the dataset can be read without
+    the program."""
     diagnostic = subject.component
     variables = {variable.name: variable for variable in diagnostic.variables()}
     for name in (*diagnostic.coordinates(), diagnostic.own_dimension, *variables):
         if name in reserved_names():
             raise PropertyError(f"the dataset already has a variable '{name}'; rename it")
     for name, variable in variables.items():
-        _refuse_unlabelled(variable, f"the variable '{name}'", "my_quantity")
+        what = f"the variable '{name}'"
+        _refuse_unlabelled(variable, what, "my_quantity", SYMBOLIC_NAME)
 
 
-def _refuse_unlabelled(quantity: Any, description: str, example: str) -> None:
-    if not re.fullmatch(NAME, quantity.name):
+def _refuse_unlabelled(quantity: Any, description: str, example: str, name: str = NAME) -> None:
+    if not re.fullmatch(name, quantity.name):
         raise PropertyError(f"{description} is not named as `{example}` is")
     for what in ("long_name", "units"):
         if not getattr(quantity, what).strip():

@@ -325,6 +325,8 @@ LOADED = [
     {"select": {"edge": "right"}, "body_force": [0.01, -0.03], "from": 2},
 ]
 """Loads of the scenes for diagnostics of loads."""
+CUTS = [{"from": [-2.0, 1.6], "to": [2.3, 1.6]}]
+"""Cuts of the scenes for diagnostics of cracks."""
 PRESSING = {
     "shape": {"half_plane": {"point": [0.0, -0.1], "normal": [0.0, 1.0]}},
     "motion": {"type": "displace", "displacement": [0.0, 0.3]},
@@ -358,7 +360,9 @@ def experiments_with(component: Component, parts: Mapping[str, Any]) -> Iterator
             if any("obstacle" in v.dims for v in component.variables()):
                 base |= {"obstacles": [PRESSING]}
         neighbours = [n for n in neighbours if n["shells"] == 1]  # The model has one threshold.
-        base |= {"loads": LOADED} if "loads" in getattr(component, "needs", ()) else {}
+        needs = getattr(component, "needs", ())
+        base |= {"loads": LOADED} if "loads" in needs else {}
+        base |= {"cuts": CUTS} if "cracks" in needs else {}
     choices = {
         "lattice": list(LATTICES.values()),
         "neighbours": neighbours,
