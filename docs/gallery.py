@@ -62,6 +62,7 @@ GROUPS = {
     "": "To start with",
     "material": "Calibrated materials",
     "modelling": "Loads, supports, contact and fracture",
+    "fracture": "Crack tips",
     "stability": "Oscillation",
     "paper": "The paper's cases",
 }
