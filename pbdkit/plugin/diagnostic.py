@@ -167,7 +167,7 @@ class CellTable:
 
     @property
     def torn(self) -> NDArray[np.bool_]:
-        """Whether a bond of the cell is broken, (cell,)."""
+        """Mask of the cells of which a bond is broken, (cell,)."""
         return np.asarray(self.broken.any(axis=1))
 
 

@@ -146,7 +146,7 @@ def crack_in_infinite_plate(cells, end, angle, folder):
 
 
 class Table:
-    """Rows of the table; `missed` says whether any goal was missed."""
+    """Rows of the table; `missed` is true if any goal was missed."""
 
     def __init__(self):
         self.missed = False
@@ -247,7 +247,7 @@ def closed_forms(table, spread):
 
 
 def main() -> int:
-    """Print the rows."""
+    """Print the rows; return 1 if a goal was missed."""
     warnings.simplefilter("ignore", AccuracyWarning)  # Displacements of K = 1 are not small.
     table, spread = Table(), []
     for K, mode in (([1.0, 0.0], "I"), ([0.0, 1.0], "II")):
