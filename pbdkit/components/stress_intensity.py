@@ -374,18 +374,18 @@ class StressIntensity(Diagnostic):
             places[:, n] = frame.origin, frame.direction
             most = self.radius or MAX_CELLS * cracks.side
             surroundings = Surroundings(now, frame, cracks.side, most)
-            radii[n], reason = surroundings.largest_radius()
-            if (least := MIN_CELLS * cracks.side) > radii[n]:
+            radius, reason = surroundings.largest_radius()
+            if (least := MIN_CELLS * cracks.side) > radius:
                 self._warn(
                     n,
-                    f"{reason} is {radii[n]:.4g} lattice units away, and a domain needs a radius "
-                    f"of {least:.4g}, so that the tip has no values; use a finer lattice, or a "
-                    "larger `radius` if it is given",
+                    f"{reason} is {max(radius, 0.0):.4g} lattice units away, and a domain needs a "
+                    f"radius of {least:.4g}, so that the tip has no values; use a finer lattice, "
+                    "or a larger `radius` if it is given",
                 )
                 continue
-            if self.radius and radii[n] < self.radius:
+            if self.radius and radius < self.radius:
                 self._warn(n, f"domains are smaller than `radius`, because {reason} is near")
-            values[:, :, n] = self._at_tip(n, surroundings, radii[n])
+            radii[n], values[:, :, n] = radius, self._at_tip(n, surroundings, radius)
         return (*values[0], *values[1], *places, radii)
 
     def _at_tip(self, n: int, surroundings: Surroundings, radius: float) -> tuple[Floats, Floats]:

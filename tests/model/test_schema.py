@@ -41,7 +41,8 @@ def test_committed_schema_is_current(name, schema):
 def test_shipped_experiments_and_their_datasets_are_described(name, monkeypatch):
     monkeypatch.setattr(breaking_kernel, "COMPILING_S", math.inf)  # compiles nothing
     of_experiment.validate(read_experiment(name).data)
-    uncut = ["cuts=[]"] if "cuts" in read_experiment(name).data else []  # they come later
+    cuts = read_experiment(name).data.get("cuts", [])
+    uncut = ["cuts=[]"] if any(cut.get("at", 0) > 4 for cut in cuts) else []
     experiment = pbdkit.load(name, settings=["steps=4", "record={every: 1}", *uncut])
     of_experiment.validate(json.loads(experiment.model_dump_json()))
     made = pbdkit.run(experiment, progress=False).to_dict(data=False)
