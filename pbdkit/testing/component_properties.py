@@ -590,6 +590,13 @@ def renews_what_it_remembers(subject: Subject) -> None:
                 raise PropertyError(f"{fault} as {number.dtype}; fractions would be lost")
 
 
+OF_REST_OFFSETS = {
+    "gather": "; compute what depends on r alone, such as `length(r)`, in `weights`",
+    "gather_pair": "; this also applies to what depends on r1 and r2 alone",
+}
+"""Remedies for numbers of double precision that are computed from rest offsets, by function."""
+
+
 @property_of(FollowerRule, FractureModel, ParticleOperation)
 def keeps_single_precision(subject: Subject) -> None:
     """Arguments of float32 give results of float32: a run in single precision must not change to
@@ -598,11 +605,10 @@ def keeps_single_precision(subject: Subject) -> None:
         for name, value in flat(call.evaluate(_single)).items():
             kind = getattr(value, "dtype", None)
             if kind is not None and kind.kind == "f" and kind != np.float32:
-                of_slot = "; compute what depends on r alone, such as `length(r)`, in `weights`"
                 raise PropertyError(
                     f"`{call.function}` returns {kind} for float32 ({name}); set no dtype, and "
                     "convert parameters and constants to plain numbers by `float(...)`"
-                    + (of_slot if call.function.startswith("gather") else "")
+                    + OF_REST_OFFSETS.get(call.function, "")
                 )
 
 

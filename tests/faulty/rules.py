@@ -86,6 +86,16 @@ class GathersDoubles(Sound):
         return d / far, 1.0 / far
 
 
+class GathersPairsOfDoubles(pbdkit.plugin.UsesAngles, Sound):
+    """Divides by a side at rest, which numpy computes in double precision."""
+
+    type: Literal["gathers-pairs-of-doubles"] = "gathers-pairs-of-doubles"
+
+    @staticmethod
+    def gather_pair(d1, d2, r1, r2, w1, w2, p):
+        return ((d1 + d2) / pbdkit.plugin.length(r2 - r1),)
+
+
 class LooksAround(Sound):
     """Moves every particle by the mean of all."""
 

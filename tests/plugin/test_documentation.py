@@ -140,6 +140,13 @@ def test_example_with_state_passes_conformance(interface, tmp_path, monkeypatch,
         assert "declares-what-it-remembers" in [outcome.property for outcome in report.ran]
 
 
+def test_example_of_a_cosine_passes_conformance(tmp_path, monkeypatch, interpreted):
+    (code,) = (b for b in blocks(text_of(pbdkit.FollowerRule)) if "class AngleStiffness" in b)
+    for report in reports_on(pbdkit.FollowerRule, code, tmp_path, monkeypatch):
+        assert report.holds, str(report)
+        assert "is-the-same-compiled" in [outcome.property for outcome in report.ran]
+
+
 @EVERY
 def test_a_page_lists_the_properties_of_its_interface(interface):
     asked = text_of(interface).split("## Required properties")[1].split("## ")[0]

@@ -66,6 +66,7 @@ FAULTS = [
     (rules.SumsInOrder, "takes-particles-in-any-order", "order in which neighbours are summed"),
     (rules.Doubles, "keeps-single-precision", "`apply` returns float64 for float32"),
     (rules.GathersDoubles, "keeps-single-precision", "such as `length(r)`, in `weights`"),
+    (rules.GathersPairsOfDoubles, "keeps-single-precision", "depends on r1 and r2 alone"),
     (rules.LooksAround, "is-local", "alone and among others"),
     (rules.NeedsArrays, "is-local", "fails with plain numbers instead of arrays"),
     (rules.Remembers, "remembers-nothing", "changes `SEEN` between calls"),
