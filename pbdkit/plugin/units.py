@@ -29,6 +29,11 @@ PATTERN = r"^\s*[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\s*[A-Za-zµμ°Å].*$"
 """Pattern of a number with a unit in a JSON Schema."""
 MAX_TEXT = 60
 """Maximum number of characters of a number with a unit."""
+RELATIVE_REMEDY = (
+    "; or write youngs_modulus: 1: stresses are then divided by Young's modulus, and forces by "
+    "Young's modulus and the thickness"
+)
+"""Remedy for a missing Young's modulus in experiments without `units`."""
 COMMON = {
     "mm": ("mm", "cm", "m", "km", "um", "nm", "inch"),
     "MPa": ("Pa", "kPa", "MPa", "GPa", "N/mm^2"),
@@ -75,6 +80,12 @@ class Quantity:
 
     def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> dict[str, Any]:
         return number_or_text(handler(schema))
+
+    @property
+    def unit_of_numbers(self) -> str:
+        """Unit of numbers that are given without a unit. They are divided by Young's modulus and
+        the thickness, so that a stress is a strain."""
+        return next((q.lattice for q in (LENGTH, PER_LENGTH, AREA) if q.length == self.length), "1")
 
     def number(self, value: Any, info: ValidationInfo) -> Any:
         """Return a number in lattice units. Values without unit are not changed.
@@ -238,7 +249,9 @@ class FromUnits:
         units: Units | None = (info.context or {}).get("units")
         number = self.otherwise if units is None else units.value(self.name)
         if number is None:
-            raise _fault(f"is missing; give it here, or as units.{self.name}")
+            is_free = units is None and self.name == "youngs_modulus"
+            remedy = RELATIVE_REMEDY if is_free else ""
+            raise _fault(f"is missing; give it here, or as units.{self.name}{remedy}")
         return number
 
 

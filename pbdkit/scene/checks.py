@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from itertools import compress, islice
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from pbdkit.model.motions import Newton, Oscillation, Rotation
 from pbdkit.plugin import Lattice, MixesCells, Vector
 from pbdkit.plugin.fields import ByRegion
 from pbdkit.plugin.rule import material_of
-from pbdkit.plugin.units import STRESS, in_lengths
+from pbdkit.plugin.units import STRESS, Place, in_lengths
 from pbdkit.scene.constants import signed_distance
 from pbdkit.scene.selection import Selecting
 
@@ -37,6 +37,12 @@ MIN_FLATNESS = 0.05
 MAX_DISTANCE = 2.0
 """A warning is issued if the distance of a selected point from the body exceeds this number of
 lattice spacings."""
+MAX_GAUGE_DISTANCE = 1.0
+"""The same limit for the points of diagnostics: no point between the particles of a body exceeds
+it."""
+MAX_EXCESS = 2.0
+"""A warning is issued if a section is wider than the body by more than this number of lattice
+spacings."""
 MAX_LISTED = 5
 """Maximum number of distant points listed in warnings."""
 ROUND_ANGLE = math.pi / 12
@@ -238,27 +244,68 @@ def _offsets(driven: Leading | Barrier, steps: int) -> list[NDArray[Any]]:
 
 
 def far_from_the_body(experiment: Experiment, raster: Raster) -> Iterator[str]:
-    """Generate a warning for each point of a selection `nearest` that is far from all particles,
-    for at most `MAX_LISTED` points."""
+    """Generate a warning for each point of a selection `nearest`, or of a diagnostic, that is far
+    from all particles, for at most `MAX_LISTED` points."""
     selections = {f"leaders.{n}": group.select for n, group in enumerate(experiment.leaders)}
     selections |= {f"loads.{n}": load.select for n, load in enumerate(experiment.loads)}
-    points = [(name, at) for name, select in selections.items() for at in select.nearest or ()]
+    points = [
+        (f"{name}.select.nearest", at, MAX_DISTANCE)
+        for name, select in selections.items()
+        for at in select.nearest or ()
+    ]
+    points += [
+        (f"diagnostics.{n}.{name}", at, MAX_GAUGE_DISTANCE)
+        for n, diagnostic in enumerate(experiment.diagnostics)
+        for name, parameter in type(diagnostic).model_fields.items()
+        if _holds_places(parameter.annotation)
+        for at in getattr(diagnostic, name) or ()
+    ]
     if not points:
         return
     body = Selecting(raster)
-    limit = MAX_DISTANCE * max(math.hypot(*vector) for vector in raster.cell.vectors)
-    far = body.least_distances(at for _, at in points) > limit
-    for name, (x, y) in islice(compress(points, far), MAX_LISTED):
+    spacing = max(math.hypot(*vector) for vector in raster.cell.vectors)
+    limits = np.array([limit for *_, limit in points]) * spacing * (1 + RADIUS_RTOL)
+    far = body.least_distances(at for _, at, _ in points) > limits
+    length, unit = in_lengths(experiment.units)
+    after = f" {unit}" if experiment.units else ""
+    for name, (x, y), _ in islice(compress(points, far), MAX_LISTED):
         rows = body.nearest([(x, y)])
         nearest = None
         if len(rows):
             nearest = (raster.particle_offset + rows[0] + 1, *raster.reference(rows)[0])
         number, at_x, at_y = raster.communicator.first(nearest)
         yield (
-            f"{name}.select.nearest: the distance of ({x:g}, {y:g}) from the body is "
-            f"{math.hypot(x - at_x, y - at_y):.4g} lattice units; the nearest particle is "
-            f"{number}, at ({at_x:.6g}, {at_y:.6g})"
+            f"{name}: the distance of ({length * x:g}, {length * y:g}){after} from the body is "
+            f"{length * math.hypot(x - at_x, y - at_y):.4g} {unit}; the nearest particle is "
+            f"{number}, at ({length * at_x:.6g}, {length * at_y:.6g}){after}"
         )
+
+
+def _holds_places(annotation: Any) -> bool:
+    """Return whether the type of a parameter is a tuple of positions, or contains one."""
+    kinds = get_args(annotation)
+    return Place in kinds or any(map(_holds_places, kinds))
+
+
+def wide_sections(
+    experiment: Experiment, raster: Raster, box: tuple[Vector[float], Vector[float]]
+) -> Iterator[str]:
+    """Generate a warning for each diagnostic `stress-strain` with a section that is wider than the
+    body, so that its nominal stress is too small."""
+    slack = MAX_EXCESS * max(math.hypot(*vector) for vector in raster.cell.vectors)
+    length, unit = in_lengths(experiment.units)
+    diagnostics: tuple[Any, ...] = experiment.diagnostics
+    for n, diagnostic in enumerate(diagnostics):
+        if diagnostic.type != "stress-strain":
+            continue
+        width, across = diagnostic.width, 1 - "xy".index(diagnostic.axis)
+        extent = box[1][across] - box[0][across]
+        if width > extent + slack:
+            yield (
+                f"diagnostics.{n}.width: {length * width:.4g} {unit}, but the body extends over "
+                f"{length * extent:.4g} {unit} along {'xy'[across]}, so that the nominal stress is "
+                "too small; give the width of the section"
+            )
 
 
 def angles_in_radians(experiment: Experiment) -> Iterator[str]:

@@ -388,6 +388,7 @@ def _build(experiment: Experiment, ground: LatticeSetup) -> Scene:
     warnings += [
         *checks.without_effect(experiment, raster),
         *checks.far_from_the_body(experiment, raster),
+        *checks.wide_sections(experiment, raster, box),
     ]
     warnings += [*checks.angles_in_radians(experiment), *checks.locking(experiment, raster, box)]
     warnings += checks.coarse_arcs(experiment, raster)

@@ -285,9 +285,13 @@ def dimensions(sweep: Sweep, experiment: Experiment, reserved: Set[str]) -> list
     """
     names = _names(sweep, {*reserved, CASE, REPLICATE, STATUS, MESSAGE})
     result = []
+
+    def labelled(path: str, values: tuple[Any, ...]) -> Coordinate:
+        return coordinate(path, values, experiment, sweep.names.get(path, path))
+
     for path, values in sweep.vary.items():
         settings = tuple((MemberSetting("vary", path, value),) for value in values)
-        coordinates = _coordinates(names[path], path, values, experiment)
+        coordinates = _coordinates(names[path], labelled(path, values))
         result.append(Dimension(names[path], settings, coordinates))
     if sweep.together:
         columns = (
@@ -296,13 +300,13 @@ def dimensions(sweep: Sweep, experiment: Experiment, reserved: Set[str]) -> list
         )
         coordinates = {CASE: Coordinate(np.arange(sweep.cases), {})}
         for path, values in sweep.together.items():
-            coordinates[names[path]] = coordinate(path, values, experiment)
+            coordinates[names[path]] = labelled(path, values)
         result.append(Dimension(CASE, tuple(zip(*columns, strict=True)), coordinates))
     if sweep.replicates > 1:
         seeds = replicate_seeds(experiment.seed, sweep.replicates)
         settings = tuple((MemberSetting("replicates", "seed", value),) for value in seeds)
         coordinates = {REPLICATE: Coordinate(np.arange(sweep.replicates), {})}
-        coordinates["seed"] = coordinate("seed", tuple(seeds), experiment)
+        coordinates["seed"] = labelled("seed", tuple(seeds))
         result.append(Dimension(REPLICATE, settings, coordinates))
     return result
 
@@ -376,27 +380,27 @@ def _tails(path: str) -> list[str]:
     return [tail for tail in tails if not tail[:1].isdecimal()] or [f"_{tails[-1]}"]
 
 
-def _coordinates(
-    name: str, path: str, values: tuple[Any, ...], experiment: Experiment
-) -> dict[str, Coordinate]:
+def _coordinates(name: str, texts: Coordinate) -> dict[str, Coordinate]:
     """Return the coordinates of the values of a parameter.
 
     Numbers are unchanged. Other values are numbered from 0, with an additional coordinate for their
     text.
     """
-    texts = coordinate(path, values, experiment)
     if texts.values.dtype.kind != "U":
         return {name: texts}
-    numbers = Coordinate(np.arange(len(values)), texts.attributes)
+    numbers = Coordinate(np.arange(len(texts.values)), texts.attributes)
     return {name: numbers, name + TEXT: texts}
 
 
-def coordinate(path: str, values: tuple[Any, ...], experiment: Experiment) -> Coordinate:
-    """Return the values of a parameter and, as attributes, its path and its unit (if it has one).
+def coordinate(
+    path: str, values: tuple[Any, ...], experiment: Experiment, long_name: str
+) -> Coordinate:
+    """Return the values of a parameter and, as attributes, its long name, its path and its unit (if
+    it has one).
 
     If all values are texts with numbers of the same unit, they are converted to numbers.
     """
-    attributes = {"long_name": path, PARAMETER: path}
+    attributes = {"long_name": long_name, PARAMETER: path}
     parts = [WITH_UNIT.fullmatch(value) if isinstance(value, str) else None for value in values]
     units = {part[2] if part else "" for part in parts}
     if len(units) == 1 and "" not in units:
@@ -416,7 +420,7 @@ def _unit(path: str, experiment: Experiment) -> str:
         if word in fields:
             quantities = [entry for entry in fields[word].metadata if isinstance(entry, Quantity)]
             if quantities or fields[word].annotation in (int, float):
-                return quantities[0].lattice if quantities else "1"
+                return quantities[0].unit_of_numbers if quantities else "1"
             part = getattr(part, word)
         elif isinstance(part, tuple) and word.isdecimal() and int(word) < len(part):
             part = part[int(word)]

@@ -265,7 +265,7 @@ STRESS_OF = [{"type": "stress", "youngs_modulus": 70e3}]
         ({"initial": SHIFTED}, "got '1 mm'; expected a plain number without a unit"),
         (
             {"units": {"length": "1 mm"}},
-            "diagnostics.1.youngs_modulus: is missing; give it here, or",
+            "diagnostics.1.youngs_modulus: is missing; give it here, or as units.youngs_modulus",
         ),
         (
             {"units": {"length": "1 mm", "youngs_modulus": "1 GPa"}},
@@ -281,6 +281,20 @@ def test_errors_have_their_place(parts: dict[str, Any], message: str) -> None:
     with pytest.raises(pbdkit.ExperimentError) as caught:
         pbdkit.Experiment(**changed(**parts))
     assert message in str(caught.value)
+
+
+def test_missing_modulus_has_a_remedy_without_units() -> None:
+    parts = {
+        "rule": {"type": "elastic", "poisson_ratio": 0.3},
+        "neighbours": {"type": "chebyshev", "shells": 1},
+    }
+    reaction = [{"type": "reaction"}]
+    with pytest.raises(pbdkit.ExperimentError, match=r"units.youngs_modulus; or write youngs_mod"):
+        pbdkit.load("paper/a", settings=parts | {"diagnostics": reaction})
+    relative = pbdkit.load(
+        "paper/a", settings=parts | {"diagnostics": [{"type": "reaction", "youngs_modulus": 1}]}
+    )
+    assert relative.diagnostics[0].thickness == 1.0
 
 
 def test_modulus_of_a_diagnostic_is_used_without_one_in_units() -> None:

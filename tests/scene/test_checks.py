@@ -96,6 +96,32 @@ def test_two_spacings_count_as_near(spacings: float, warned: int) -> None:
     assert len(warnings_of(leaders=[{"select": select, "motion": HOLD}])) == warned
 
 
+GAUGE = {"type": "stress-strain", "youngs_modulus": 1.0, "width": 2.0, "group": 0}
+
+
+def test_gauge_point_beside_the_body_is_named() -> None:
+    near = GAUGE | {"points": [[0.0, 1.2], [4.3, 2.4]]}  # .5 from the corner: one spacing
+    assert warnings_of(diagnostics=[near]) == []
+    far = GAUGE | {"points": [[1.0, 1.0], [4.0, 2.6]]}
+    words = "diagnostics.0.points: the distance of (4, 2.6) from the body is 0.6 lattice units; "
+    assert warnings_of(diagnostics=[far]) == [f"{words}the nearest particle is 45, at (4, 2)"]
+    far |= {"youngs_modulus": "1 MPa"}
+    (text,) = warnings_of(diagnostics=[far], units={"length": "2 mm"})
+    assert (
+        "of (8, 5.2) mm from the body is 1.2 mm; the nearest particle is 45, at (8, 4) mm" in text
+    )
+
+
+def test_section_wider_than_the_body_has_a_warning() -> None:
+    gauge = GAUGE | {"points": [[0.5, 1.0], [3.5, 1.0]]}
+    assert warnings_of(diagnostics=[gauge | {"width": 3.0}]) == []
+    (text,) = warnings_of(diagnostics=[gauge | {"width": 3.1}])
+    assert text.startswith(
+        "diagnostics.0.width: 3.1 lattice units, but the body extends over 2 lattice units along y"
+    )
+    assert warnings_of(diagnostics=[gauge | {"axis": "y", "width": 3.1}]) == []
+
+
 def test_only_some_of_many_points_are_named() -> None:
     select = {"nearest": [[50.0 + n, 0.0] for n in range(20)]}
     assert len(warnings_of(leaders=[{"select": select, "motion": HOLD}])) == 5

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import pbdkit
+from pbdkit.sweeps.specification import coordinate
 
 PLATE = {
     "name": "plate",
@@ -39,7 +40,8 @@ def swept():
 def test_parameters_have_names_units_and_their_paths(swept):
     assert swept.status.dims == ("poisson_ratio", "steel", "span")
     said = {name: swept[name].attrs for name in swept.status.dims}
-    assert [one["long_name"] for one in said.values()] == [*VARY]
+    assert [one["long_name"] for one in said.values()] == [*[*VARY][:2], "span"]
+    assert [one["parameter"] for one in said.values()] == [*VARY]
     assert (said["span"]["units"], swept.span.values.tolist()) == ("mm", [7.0, 8.0])
 
 
@@ -148,3 +150,27 @@ def test_commands_select_a_member(swept, call, tmp_path, monkeypatch):
     wrong = call("explain", "s.nc", "--at", "steel=4")
     assert (wrong.code, "--at steel=4: no member has this value" in wrong.err) == (2, True)
     assert "expected NAME=VALUE" in call("plot", "s.nc", "--at", "steel").err
+
+
+@pytest.mark.parametrize(
+    ("path", "unit"),
+    [
+        ("fracture.failure", "1"),
+        ("fracture.energy", "lattice unit"),
+        ("lattice.a", "lattice unit"),
+    ],
+)
+def test_numbers_without_a_unit_are_divided_by_the_modulus(path, unit):
+    fracture = {"type": "cohesive", "energy": 0.1, "onset": 0.1}
+    if path == "fracture.failure":
+        fracture = {"type": "strain", "failure": 0.1}
+    rule = {"type": "elastic", "poisson_ratio": 0.3}
+    parts = {"rule": rule, "fracture": fracture, "neighbours": {"type": "chebyshev"}}
+    experiment = pbdkit.load(
+        "paper/a", settings=parts | {"frame": {"type": "natural"}, "diagnostics": []}
+    )
+    assert coordinate(path, (0.1, 0.2), experiment, "limit").attributes == {
+        "long_name": "limit",
+        "parameter": path,
+        "units": unit,
+    }
