@@ -6,7 +6,7 @@ import re
 import sys
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Generator, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -24,7 +24,7 @@ from pbdkit.io.recorder import Recorder, RunOutcome, Snapshots
 from pbdkit.io.sinks import KeepingSink, MemorySink, OverlappingSink, Sink
 from pbdkit.linear.stencil import Bound, wave_bound
 from pbdkit.model.loading import as_experiment
-from pbdkit.model.solver import Equilibrium, Solver, Stepping
+from pbdkit.model.solver import Control, Equilibrium, Solver, Stepping
 from pbdkit.progress import StoppedError, Watch
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.stability.forecast import further_warnings, prediction, quick_warnings
@@ -305,14 +305,30 @@ class EquilibriumDriver(Driver):
     choice = Choice("equilibrium", 1, "requested")
     moment = 0.0
     """Time up to which the load has been applied, in steps."""
+    part = 1.0
+    """With a control, part of a step by which the next increment advances."""
+    order: Sequence[int] = ()
+    """With a control, places in the order in which their responses were computed."""
 
     def state_dict(self) -> dict[str, Any]:
         """Return the state and the time from which the next increment starts."""
-        return {"state": self.state, "moment": self.moment}
+        parts: dict[str, Any] = {"state": self.state, "moment": self.moment}
+        if self._control:
+            parts |= {"part": self.part, "order": list(self.order)}
+            parts |= {name: getattr(self.state, name) for name in ("load_factor", "dissipated")}
+        return parts
 
     def load_state_dict(self, parts: Mapping[str, Any]) -> None:
         """Restore the result of `state_dict`."""
         self.state, self.moment = parts["state"], float(parts["moment"])
+        if self._control:
+            self.part, self.order = float(parts["part"]), parts["order"]
+            for name in ("load_factor", "dissipated"):
+                setattr(self.state, name, float(parts[name]))
+
+    @property
+    def _control(self) -> Control | None:
+        return self.scene.experiment.solver.equilibrium.control
 
     def states(self) -> States:
         """Generate the states of the run.
@@ -347,7 +363,11 @@ class EquilibriumDriver(Driver):
         return outcome
 
     def _path(self, state: State) -> EquilibriumPath:
-        """Follow the load from a state to equilibrium."""
+        """Follow the load from a state to equilibrium, or the branch of a control."""
+        if self._control:
+            from pbdkit.equilibrium.branch import follow
+
+            return follow(self.scene, state, self.watch, self.moment, self.part, self.order)
         from pbdkit.equilibrium.load_stepping import increments
 
         return increments(self.scene, state, self.watch, self.moment, stops=self._stops)
@@ -371,6 +391,7 @@ class EquilibriumDriver(Driver):
                 error_bound: ErrorBound = end.value
                 return error_bound
             self.moment, self.is_complete = reached.moment, reached.is_last
+            self.part, self.order = reached.part, reached.order
             is_within = records_all and reached.at_rest and reached.moment != reached.state.step
             self.load_time = reached.moment if is_within else None
             yield reached.state

@@ -38,7 +38,7 @@ def scene_of(given: dict[str, Any], **parts: Any) -> Scene:
 
 def test_every_solver_has_a_driver_and_only_its_parameters() -> None:
     assert set(DRIVERS) == set(Solver.__subclasses__())
-    assert set(Equilibrium.model_fields) == {"type", "method", "tolerance", "increments"}
+    assert set(Equilibrium.model_fields) == {"type", "method", "tolerance", "increments", "control"}
     assert not hasattr(Equilibrium(), "relaxation")
 
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from pbdkit.model.boundary_conditions import Driven, LeaderGroup, Load
 from pbdkit.model.experiment import Experiment
+from pbdkit.model.solver import OpeningControl
 from pbdkit.plugin import RenewsParticles
 from pbdkit.plugin.units import BODY_FORCE, FORCE, Units, in_lengths
 from pbdkit.progress import waiting
@@ -108,7 +109,7 @@ def _run_rows(loaded: Experiment, scene: Scene, predicted: Forecast) -> Iterator
     else:
         count = loaded.record_count - 1
         equilibria = f", one for each of {count} recorded steps" if count > 1 else ""
-        yield "solver", f"computes the equilibrium directly{equilibria}; steps would converge to it"
+        yield "solver", _described(loaded, equilibria)
         from pbdkit.equilibrium.load_stepping import changes
 
         if steps_of_changes := changes(scene, loaded.steps):
@@ -123,6 +124,14 @@ def _run_rows(loaded: Experiment, scene: Scene, predicted: Forecast) -> Iterator
     time = "" if predicted.seconds is None else f"{_seconds(predicted.seconds)} of stepping, "
     memory = f"{predicted.memory_mib:.3g} MiB of memory, {predicted.output_mib:.3g} MiB of output"
     yield "cost", f"{time}{memory} (estimates)"
+
+
+def _described(experiment: Experiment, equilibria: str) -> str:
+    """Return the description of the solver `equilibrium`."""
+    if control := experiment.solver.equilibrium.control:
+        quantity = "opening" if isinstance(control, OpeningControl) else "dissipated energy"
+        return f"follows the branch of equilibria by the {quantity}; the load is an unknown"
+    return f"computes the equilibrium directly{equilibria}; steps would converge to it"
 
 
 def _row_of(title: str, groups: Iterable[str], limit: int | None) -> Iterator[Row]:

@@ -179,6 +179,10 @@ class Reached(NamedTuple):
     at_rest: bool
     is_last: bool = False
     """True for the last point of the path."""
+    part: float = 1.0
+    """On the branch of a control, part of a step by which the next increment advances."""
+    order: tuple[int, ...] = ()
+    """On the branch of a control, places in the order in which their responses were computed."""
 
 
 EquilibriumPath = Generator[Reached, None, ErrorBound]
@@ -211,6 +215,11 @@ def increments(
     StoppedError on interruption. After an exception, `state` is the last state reached.
     """
     settings, steps = scene.experiment.solver.equilibrium, scene.experiment.steps
+    if settings.control:
+        raise ExperimentError(
+            "the equilibrium is computed for a given load here; remove the control",
+            ("solver", "control"),
+        )
     for n, driven in enumerate(scene.driven):
         if driven.group.leads(steps) and driven.group.motion.rests_after() is None:
             count = len(scene.leading)

@@ -72,6 +72,11 @@ class Moves:
             sweep = MoveFollowers(stepped, SlotFollowers(stepped, stepping))
             self._operations = moves_of(stepped, sweep)
 
+    def scale_loads(self, factor: float) -> None:
+        """Multiply the loads by a factor from now on."""
+        if self._loads:
+            self._loads.factor = factor
+
     @property
     def is_compiled(self) -> bool:
         """True if moves are evaluated by a compiled engine."""

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import Field, dataclass, field, fields, is_dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -105,7 +105,11 @@ class Checkpoint:
         """Return only the state and the recorded steps. Raises KeyError, TypeError, ValueError or
         StorageError if they are damaged."""
         classes = CLASSES | {state_class.__name__: state_class}
-        state = unpack(self.facts["run"]["state"], self.arrays, classes)
+        run = self.facts["run"]
+        state = unpack(run["state"], self.arrays, classes)
+        for each in fields(state_class):
+            if not _is_stored(each) and each.name in run:
+                setattr(state, each.name, float(run[each.name]))
         return state, unpack(self.facts["seen"], self.arrays, classes)
 
     def parts(
@@ -182,6 +186,12 @@ def _is_like(facts: Any, template: Any) -> bool:
     return facts is None or (isinstance(facts, int) and abs(facts) < 2**63)
 
 
+def _is_stored(attribute: Field[Any]) -> bool:
+    """Return whether checkpoints contain an attribute as part of its object, and not only among the
+    data of the driver."""
+    return bool(attribute.metadata.get("checkpoint", True))
+
+
 def pack(value: Any, name: str, arrays: Arrays) -> Any:
     """Convert a value to facts for JSON. Arrays in the value are added to `arrays`, with names that
     begin with `name`."""
@@ -189,7 +199,8 @@ def pack(value: Any, name: str, arrays: Arrays) -> Any:
         arrays[name] = value
         return {"array": name}
     if is_dataclass(value):
-        parts = {f.name: getattr(value, f.name) for f in fields(value)}
+        stored = [each.name for each in fields(value) if _is_stored(each)]
+        parts = {field_name: getattr(value, field_name) for field_name in stored}
         inner = {key: pack(part, f"{name}.{key}", arrays) for key, part in parts.items()}
         return {"is": NAMES.get(type(value), type(value).__name__), **inner}
     if isinstance(value, dict):

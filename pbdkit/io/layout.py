@@ -25,7 +25,7 @@ from pbdkit.model.schema import DIALECT
 from pbdkit.plugin import Component, Diagnostic, Remembered, Variable
 from pbdkit.plugin.discovery import refuse_retired
 from pbdkit.plugin.registry import GIVEN, Registry
-from pbdkit.plugin.units import LENGTH, QUANTITIES
+from pbdkit.plugin.units import AREA, LENGTH, QUANTITIES
 from pbdkit.scene.scene import Scene, build_scene
 
 if TYPE_CHECKING:
@@ -170,7 +170,9 @@ def optional_columns() -> list[list[Column]]:
     """Return the columns that depend on the experiment, but not on its diagnostics. These are the
     columns of the table of bonds, with the step in which each bond broke, and two kinds of
     coordinates: the coordinate of quantities that are measured at every step, and the coordinates
-    of leader groups, loads, obstacles and principal values."""
+    of leader groups, loads, obstacles and principal values. Further columns are the quantities of
+    a branch that is followed by a control: the load factor, the dissipated energy and the
+    opening."""
     bond, by_ends = ("bond",), "counted from 1, by its ends"
     whole = "-1 where it has not broken"
     no_strain = "NaN where it has not broken, was cut, or was broken from the start"
@@ -192,6 +194,27 @@ def optional_columns() -> list[list[Column]]:
         [coordinate("load", "load", comment=place)],
         [coordinate("obstacle", "obstacle", comment=place)],
         [coordinate("principal", "principal value", comment="1 the larger one, 2 the smaller one")],
+        [
+            Column(
+                "load_factor",
+                ("time",),
+                "f8",
+                When.RECORD,
+                "load factor",
+                "1",
+                comment="factor of the loads and prescribed displacements of the last step",
+            ),
+            Column(
+                "dissipated_energy",
+                ("time",),
+                "f8",
+                When.RECORD,
+                "dissipated energy",
+                AREA.lattice,
+                comment="divided by Young's modulus and thickness",
+            ),
+        ],
+        [Column("opening", ("time",), "f8", When.RECORD, "opening", LENGTH.lattice)],
     ]
 
 

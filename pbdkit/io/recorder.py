@@ -24,10 +24,12 @@ from pbdkit.io.sinks import MemorySink, Sink
 from pbdkit.io.snapshot import StateMoment, Tables
 from pbdkit.lattice.raster import FRAME
 from pbdkit.model.experiment import Experiment
+from pbdkit.model.solver import OpeningControl
 from pbdkit.plugin import Diagnostic, Moment, RenewsBonds, RenewsParticles, Variable
 from pbdkit.plugin.component import as_values
 from pbdkit.plugin.discovery import errors_attributed_to
 from pbdkit.scene.constants import bond_numbers, particle_numbers
+from pbdkit.scene.opening import Opening
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import State
 
@@ -323,6 +325,8 @@ class Recorder:
                 raise FloatingPointError(f"particle {offset + row + 1} at step {state.step}")
             values = {"time": time, "position": position, "kind": moment.kind()}
             values |= self._measured.remembered(moment, first=self.last_steps.recorded < 0)
+            if experiment.solver.equilibrium.control:
+                values |= _of_branch(state, self._opening)
             values |= self._diagnosed(When.RECORD, moment)
         stepped = recorded or experiment.solver.makes_steps
         if self._measured.every_step and stepped and not last:
@@ -351,6 +355,12 @@ class Recorder:
             self.sink.put(self._copies.add_to(self._diagnosed(When.END, moment)))
         self.sink.finish(self._attributes(outcome, prediction))
 
+    @cached_property
+    def _opening(self) -> Opening | None:
+        """The opening that is recorded."""
+        by_opening = isinstance(self._scene.experiment.solver.equilibrium.control, OpeningControl)
+        return Opening.of(self._scene) if by_opening else None
+
     def _inside_out(self, state: State) -> str | None:
         return StateMoment(state, self._tables).cells.inside_out()
 
@@ -362,6 +372,12 @@ class Recorder:
             "stop_reason": outcome.stop_reason,
             "created": datetime.now(UTC).isoformat(timespec="seconds"),
         } | ({"certificate": json.dumps(outcome.error_bound)} if outcome.error_bound else {})
+
+
+def _of_branch(state: State, opening: Opening | None) -> Values:
+    """Return the quantities of a branch that is followed by a control."""
+    values = {"load_factor": state.load_factor, "dissipated_energy": state.dissipated}
+    return values | ({"opening": opening.at(state.u)} if opening else {})
 
 
 def provenance_of(experiment: Experiment) -> dict[str, str]:
@@ -418,7 +434,7 @@ class Snapshots:
 
 def columns_of(scene: Scene) -> list[Column]:
     """Return the columns of a scene's dataset."""
-    measured = RecordedVariables(scene)
+    measured, control = RecordedVariables(scene), scene.experiment.solver.equilibrium.control
     wanted = (
         scene.experiment.shows_bonds,
         scene.has_fracture,
@@ -427,6 +443,8 @@ def columns_of(scene: Scene) -> list[Column]:
         measured.shows_loads,
         measured.shows_obstacles,
         measured.shows_principal,
+        control is not None,
+        isinstance(control, OpeningControl),
     )
     optional = chain(*compress(layout.optional_columns(), wanted))
     lattice_columns = [*layout.base_columns(scene.axes), *optional, *measured.columns()]

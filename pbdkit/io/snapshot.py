@@ -634,9 +634,13 @@ class StateMoment(Moment):
 
     def loads(self) -> tuple[LoadRows, ...]:
         """Return the loads as they act in this step."""
-        loads = self._scene.loads
+        loads, factor = self._scene.loads, self._state.load_factor
         return tuple(
-            LoadRows(read_only(each.rows), read_only(each.share), each.load.force_at(self._now))
+            LoadRows(
+                read_only(each.rows),
+                read_only(each.share),
+                0.0 + factor * each.load.force_at(self._now),
+            )
             for each in (loads.each if loads else ())
         )
 

@@ -32,11 +32,12 @@ from pbdkit.model.bodies import BODIES, AnyBody, Body, Box
 from pbdkit.model.boundary_conditions import AnyInitial, Cut, LeaderGroup, Load, Obstacle
 from pbdkit.model.motions import Newton
 from pbdkit.model.reading import OF_PROGRAM, Settings, Source, with_settings
-from pbdkit.model.solver import AnySolver, Equilibrium, Record, Stepping
+from pbdkit.model.solver import AnySolver, DissipationControl, Equilibrium, Record, Stepping
 from pbdkit.model.validation import brief, fault, open_part, report
 from pbdkit.plugin import (
     INTERFACES,
     LISTS,
+    BreaksAtStrain,
     Component,
     Diagnostic,
     Draws,
@@ -47,9 +48,11 @@ from pbdkit.plugin import (
     Loadable,
     NeighbourMetric,
     ParticleOperation,
+    RenewsBonds,
     RenewsParticles,
     Softens,
     SoftensCells,
+    TearsCells,
 )
 from pbdkit.plugin.component import Strict, as_values
 from pbdkit.plugin.discovery import Retired, errors_attributed_to, retired_parts, with_successors
@@ -97,6 +100,8 @@ def _checks(experiment: Any) -> Iterator[tuple[Key, bool, str]]:
     yield from _neighbour_checks(experiment)
     yield from _event_checks(experiment)
     yield from _force_checks(experiment)
+    if experiment.solver.equilibrium.control:
+        yield from _control_checks(experiment)
 
 
 def _neighbour_checks(experiment: Any) -> list[tuple[Key, bool, str]]:
@@ -175,6 +180,47 @@ def _force_checks(experiment: Any) -> list[tuple[Key, bool, str]]:
          f"the rule '{rule.type}' with these parameters defines moves, but no forces and no "
          "stiffness; use a calibrated rule ('elastic' or 'strain-gradient' with poisson_ratio "
          "above -1, 'orthotropic', 'springs')"),
+    ]  # fmt: skip
+
+
+def _control_checks(experiment: Any) -> list[tuple[Key, bool, str]]:
+    """Check that the load of an experiment can be an unknown, which a control determines."""
+    rule, fracture, steps = experiment.rule, experiment.fracture, experiment.steps
+    driven = [*experiment.leaders, *experiment.loads]
+    acts = all(each.from_ == 1 and (each.until or steps) >= steps for each in driven)
+    dissipates = isinstance(experiment.solver.equilibrium.control, DissipationControl)
+    gradually, key = isinstance(fracture, RenewsBonds), ("solver", "control")
+    tears = isinstance(rule, TearsCells) and experiment.frame.weighs_cells
+    return [
+        (key, not rule.linear or material_of(rule) is None,
+         f"the branch of equilibria is computed for linear rules with forces, and '{rule.type}' is "
+         "none; use 'elastic' with poisson_ratio above -1 or 'orthotropic'"),
+        (key, fracture.can_break and not tears,
+         "damage on the branch of equilibria is computed by cells; use rule: {type: elastic, ...} "
+         "or {type: orthotropic, ...}, with frame: {type: natural}"),
+        (key, dissipates and not gradually,
+         f"'{fracture.type}' does not soften, so that there is no load for a dissipated energy; "
+         "use fracture: {type: cohesive, ...} or {type: damage, ...}, or control: {type: opening, "
+         "...}"),
+        (key, dissipates and steps < 2,
+         "the first step ends where damage begins; set steps to 2 or more"),
+        (key, fracture.can_break and not gradually and not isinstance(fracture, BreaksAtStrain),
+         f"'{fracture.type}' has no breaking strain, so that it is not known which bond breaks "
+         "first; use 'threshold', 'strain', 'damage' or 'cohesive'"),
+        (key, not driven, "there is no load; add loads, or leaders that move"),
+        (key, not acts,
+         "all leaders and loads are multiplied by one load factor, and have to act in all steps; "
+         "remove their `from` and `until`"),
+        (key, any(cut.at > 0 for cut in experiment.cuts),
+         "a cut during the run would change the branch; make it at step 0"),
+        (key, bool(experiment.time_dependent),
+         "parameters cannot depend on time, because the load factor takes the place of time; give "
+         "single numbers"),
+        (key, bool(experiment.obstacles), "obstacles are not supported; remove them"),
+        (key, bool(experiment.operations),
+         "operations of particles are not supported; remove them"),
+        (key, not experiment.initial.at_rest,
+         "the branch starts from the body at rest; remove `initial`"),
     ]  # fmt: skip
 
 

@@ -7,13 +7,22 @@ from collections.abc import Iterator
 from functools import cache
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Discriminator, Field, SerializeAsAny, Tag, model_serializer, model_validator
+from pydantic import (
+    Discriminator,
+    Field,
+    SerializeAsAny,
+    SerializerFunctionWrapHandler,
+    Tag,
+    model_serializer,
+    model_validator,
+)
 
 from pbdkit.errors import ExperimentError
-from pbdkit.model.validation import closed_part
+from pbdkit.model.validation import closed_part, fault
 from pbdkit.plugin import Component
 from pbdkit.plugin.component import Strict
 from pbdkit.plugin.schedule import PLAIN, TIME_DEPENDENT, WORD, TimeDependent, form_of, last
+from pbdkit.plugin.units import ENERGY, LENGTH, Place
 
 Steps = Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(strict=False, min_length=1)]
 """Type of a list of recorded steps."""
@@ -241,6 +250,67 @@ def _number(setting: Literal["auto"] | float | TimeDependent[float], name: str) 
     return last(setting)
 
 
+Toward = Annotated[tuple[float, float], Field(strict=False)]
+"""Type of a direction; its length does not matter."""
+
+
+class Control(Component):
+    """Quantity that is prescribed in place of the load."""
+
+
+class OpeningControl(Control):
+    """Prescribe the relative displacement of two points; the load follows from it.
+
+    The points are the body particles nearest to `between`. The opening is the component of the
+    displacement of the second one, minus that of the first one, along `direction`; by default this
+    is the direction from the first point to the second one. It grows from 0 to `to` in equal parts,
+    one for each step. The prescribed displacements and the loads of the last step are multiplied by
+    the load factor that causes the opening.
+    """
+
+    type: Literal["opening"] = "opening"
+    between: Annotated[tuple[Place, Place], Field(strict=False)] = Field(
+        description="Two points; the nearest particles are used.",
+        examples=[((9.0, 0.0), (11.0, 0.0))],
+    )
+    direction: Toward | None = Field(
+        None, description="Direction of the opening; by default from the first point to the second."
+    )
+    to: Annotated[float, Field(ge=-1e100, le=1e100), LENGTH] = Field(
+        description="Opening in the last step.", examples=[0.1]
+    )
+
+    @model_validator(mode="after")
+    def _has_direction(self) -> OpeningControl:
+        if self.to == 0.0:
+            raise fault("the opening in the last step is 0; give a length other than 0", key="to")
+        if self.direction is not None and not any(self.direction):
+            raise fault("the direction is zero; give one, such as [1, 0]", key="direction")
+        return self
+
+
+class DissipationControl(Control):
+    """Prescribe the dissipated energy; the load follows from it.
+
+    The first step ends at the load at which damage begins. In each further step the same energy is
+    dissipated, up to `to` in the last one. The prescribed displacements and the loads of the last
+    step are multiplied by the load factor at which this energy has been dissipated.
+    """
+
+    type: Literal["dissipation"] = "dissipation"
+    to: Annotated[float, Field(gt=0.0, le=1e100), ENERGY] = Field(
+        description="Energy that has been dissipated in the last step, divided by Young's modulus "
+        "and thickness (lattice units); with a unit also the energy.",
+        examples=[1e-4],
+    )
+
+
+AnyControl = Annotated[
+    SerializeAsAny[Control], closed_part(Control, OpeningControl, DissipationControl)
+]
+"""Type of the control of an equilibrium branch."""
+
+
 class Equilibrium(Solver):
     """Compute the limit of the steps directly, with leaders at their last prescribed positions.
 
@@ -250,6 +320,8 @@ class Equilibrium(Solver):
     is computed for each. With nonlinear rules, the number of increments is adaptive. `method` is
     the method for linear systems: lu, multigrid (as the preconditioner of an iteration) or
     conjugate-gradients (without preconditioner); auto selects a method by the size of the system.
+    With `control` the load is an unknown: the equilibria of a branch are computed for prescribed
+    openings or dissipated energies, one for each step, beyond the peak of the load too.
     """
 
     makes_steps: ClassVar[bool] = False
@@ -257,6 +329,15 @@ class Equilibrium(Solver):
     method: Literal["auto", "lu", "multigrid", "conjugate-gradients"] = "auto"
     tolerance: Annotated[float, Field(gt=0.0, lt=1.0)] = 1e-8
     increments: Annotated[int, Field(ge=1, le=100_000)] = 100
+    control: AnyControl | None = None
+
+    @model_serializer(mode="wrap")
+    def _as_written(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Omit `control` from the serialised solver if there is none."""
+        result: dict[str, Any] = serialize(self)
+        if self.control is None:
+            result.pop("control", None)
+        return result
 
     @property
     def equilibrium(self) -> Equilibrium:

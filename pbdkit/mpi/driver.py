@@ -409,6 +409,11 @@ def _refuse_solver(scene: Scene) -> None:
         scene,
         [
             (
+                experiment.solver.equilibrium.control is not None,
+                ("solver", "control"),
+                "a branch of equilibria",
+            ),
+            (
                 grid is None,
                 ("neighbours",),
                 "an equilibrium with neighbours beyond adjacent cells",

@@ -62,26 +62,32 @@ class Loads:
         Shape of the raster.
     held_at
         Moment at which the loads are evaluated. If it is None, they are evaluated at each step.
+    factor
+        Number by which the forces are multiplied.
     """
 
     each: tuple[Loading, ...]
     shape: tuple[int, ...]
     held_at: float | None = None
+    factor: float = 1.0
     _last: tuple[Any, Planes] | None = field(default=None, repr=False)
 
     def restrict(self, to: Restriction) -> Loads:
         """Return the loads restricted to the particles of some rows."""
         each = tuple(loading.restrict(to) for loading in self.each)
-        return Loads(each, to.part.shape, self.held_at)
+        return Loads(each, to.part.shape, self.held_at, self.factor)
 
     def at(self, moment: float, dtype: Any) -> Planes:
         """Return the forces at the end of a step, or at a moment within it. The array is shared and
         must not be changed."""
         moment = moment if self.held_at is None else self.held_at
         forces = [loading.load.force_at(moment).tolist() for loading in self.each]
-        key = forces, np.dtype(dtype)
+        key = self.factor, forces, np.dtype(dtype)
         if self._last is None or self._last[0] != key:
-            self._last = key, self._sum(moment).astype(dtype, copy=False)
+            planes = self._sum(moment)
+            if self.factor != 1.0:
+                planes *= self.factor
+            self._last = key, planes.astype(dtype, copy=False)
         return self._last[1]
 
     def _sum(self, moment: float) -> Planes:

@@ -11,7 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.lattice.neighbourhood import bonds_in, plane_block
-from pbdkit.plugin import CellStress, FractureModel, RenewsBonds, SoftensCells, Vector, length
+from pbdkit.plugin import (
+    BreaksAtStrain,
+    CellStress,
+    FractureModel,
+    RenewsBonds,
+    SoftensCells,
+    Vector,
+    length,
+)
 from pbdkit.plugin.discovery import errors_attributed_to
 from pbdkit.plugin.vector import vector
 from pbdkit.scene.constants import bond_numbers
@@ -59,28 +67,53 @@ class Fracturing:
 
     def break_bonds(
         self, m: NDArray[Any], state: State, step: int, *, in_turn: bool = False
-    ) -> None:
+    ) -> bool:
         """Update the state variables of bonds in the intermediate configuration m, in place, and
         record the step and the length of the bonds that break.
 
         With `in_turn` cells soften one after the other: only the cells with the largest load begin
         to soften, and only when the damage of the cells that already soften has become nearly
-        constant.
+        constant. Return whether cells have to wait for this damage.
         """
         assert state.broken_step is not None
         assert state.broken_length is not None
         when = f"at step {step}"
         renewed: Iterable[UpdatedBonds] = self._renewed(m, state, when)
+        waits = False
         if in_turn and self._cells:
             old = [value.copy() for value in state.bond_values]
             renewed = list(renewed)
-            self._hold_back(old, renewed)
+            waits = self._hold_back(old, renewed)
         for part in renewed:
             breaks = self._breaks(part, when)
             if breaks.any():
                 state.broken_step[part.owner][breaks] = step
                 current = part.r + part.d.each(lambda values, where=breaks: values[where])
                 state.broken_length[part.owner][breaks] = length(current)
+        return waits
+
+    def break_most_strained(self, m: NDArray[Any], state: State, step: int) -> bool:
+        """Break the bond with the largest ratio of strain to breaking strain in a configuration m,
+        if the ratio exceeds 1, and all bonds with the same ratio. Return whether a bond breaks."""
+        assert state.broken_step is not None
+        assert state.broken_length is not None
+        model, when = self._model, f"at step {step}"
+        assert isinstance(model, BreaksAtStrain)
+        breaking = []
+        for part in self._renewed(m, state, when):
+            breaks = self._breaks(part, when)
+            if breaks.any():
+                limit = self._evaluator.breaking_strain(part.r, part.limits, part.numbers)
+                current = np.asarray(length(part.r + part.d))
+                strain = current / length(part.r) - 1.0
+                ratio = np.divide(strain, limit, out=np.zeros_like(strain), where=breaks)
+                breaking.append((part.owner, current, ratio))
+        largest = max((float(ratio.max()) for _, _, ratio in breaking), default=0.0)
+        for owner, current, ratio in breaking:
+            first = ratio >= largest * (1.0 - TIE_RTOL)
+            state.broken_step[owner][first] = step
+            state.broken_length[owner][first] = current[first]
+        return bool(breaking)
 
     def may_break(self, u: NDArray[Any], state: State, within: float) -> bool:
         """Return whether any bond breaks at u, or would break if the relative displacement of its
@@ -124,10 +157,10 @@ class Fracturing:
                 part.intact & self._evaluator.breaks(part.d, part.r, part.limits, part.numbers)
             )
 
-    def _hold_back(self, previous: list[NDArray[Any]], parts: Sequence[UpdatedBonds]) -> None:
+    def _hold_back(self, previous: list[NDArray[Any]], parts: Sequence[UpdatedBonds]) -> bool:
         """Restore the state variables of cells that would begin to soften, except the cells with
         the largest load. As long as the damage of cells that already soften still changes, restore
-        the state variables of all cells that would begin."""
+        the state variables of all cells that would begin. Return whether all of them wait."""
         change, largest = 0.0, 0.0
         sides = [[name.endswith(side) for name in self._numbers] for side in ("_left", "_right")]
         waiting = []
@@ -151,6 +184,7 @@ class Fracturing:
         for begins, load, old, new in waiting:
             for a, b in zip(old, new, strict=True):
                 np.copyto(b, a, where=begins & (load < threshold))
+        return bool(waiting) and threshold == math.inf
 
     def _load(self, part: UpdatedBonds, side: int) -> NDArray[Any]:
         """Return the load of the cells on one side of bonds. If there is no cell on that side, at

@@ -157,10 +157,10 @@ def _beside(scene: Scene, slot: Slot, side: Side) -> CellBeside:
     polygons = scene.neighbourhood.tiling.polygons
     polygon = next(p for p in polygons if (p.source, p.kind) == (source, side.kind))
     corners = tuple((c.target, tuple(map(add, step, c.cell))) for c in polygon.corners)
-    return CellBeside(corners, _rates(polygon), side)
+    return CellBeside(corners, rates_of(polygon), side)
 
 
-def _rates(polygon: CellPolygon) -> tuple[Vector, ...]:
+def rates_of(polygon: CellPolygon) -> tuple[Vector, ...]:
     """Return the rates of the mean gradient of a polygon (Green): ½ (y_k+1 - y_k-1, x_k-1 - x_k+1),
     divided by its area."""
     r, twice = polygon.rest, 2.0 * float(signed_area(polygon.rest))

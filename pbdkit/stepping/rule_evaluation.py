@@ -21,6 +21,7 @@ from pbdkit.errors import AnswerError
 from pbdkit.lattice.cells import CellBond, WeighedCells
 from pbdkit.lattice.raster import EMPTY, FOLLOWER, Raster, Where
 from pbdkit.plugin import (
+    BreaksAtStrain,
     Calibrated,
     CellStress,
     FollowerRule,
@@ -230,6 +231,12 @@ class Evaluator:
         """Return whether bonds with the given state variables break."""
         c = self._scene.constants.of_bond(*limits, *shown(own))
         return as_verdict(self._model.breaks(d, r, c, self._q))
+
+    def breaking_strain(self, r: Vector, limits: Any, own: Sequence[Any]) -> Any:
+        """Return the strains above which bonds with the given state variables break."""
+        assert isinstance(self._model, BreaksAtStrain)
+        c = self._scene.constants.of_bond(*limits, *shown(own))
+        return self._model.breaking_strain(r, c, self._q)
 
     def everywhere(self, slots: Iterable[Slot]) -> list[Neighbour]:
         """Return the neighbours in the interior of a body: all are present, no bond is broken, and

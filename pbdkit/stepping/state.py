@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -55,6 +55,11 @@ def cut_bonds(scene: Scene, broken: BrokenSteps | None, step: int) -> bool:
     return bool(segments)
 
 
+NUMBERS = ("step", "load_factor", "dissipated")
+"""Attributes of a state that are numbers."""
+BY_DRIVER = {"checkpoint": False}
+"""Metadata of attributes that checkpoints contain only among the data of the driver. The states in
+checkpoints are then those of earlier versions."""
 Values = tuple[Array, ...]
 """Type of state variables: one array each, in the order of their declarations."""
 
@@ -73,7 +78,8 @@ class State:
     the velocities of a group that moves by Newton's law. The entry is None if the group has not
     begun. `bond_values` are the state variables of the fracture model for each bond, with the shape
     of `broken_step`. `particle_values` are the state variables of the rule for each particle,
-    (sublattice, cell, cell).
+    (sublattice, cell, cell). If the solver has a `control`, `load_factor` multiplies the loads, and
+    `dissipated` is the dissipated energy, divided by Young's modulus and thickness.
     """
 
     step: int
@@ -84,6 +90,8 @@ class State:
     starts: tuple[Floats | None, ...]
     bond_values: Values = ()
     particle_values: Values = ()
+    load_factor: float = field(default=1.0, metadata=BY_DRIVER)
+    dissipated: float = field(default=0.0, metadata=BY_DRIVER)
 
     def copy(self, over: State | None = None) -> State:
         """Return a copy. If another state `over` of the same scene is given, its arrays are
@@ -93,7 +101,8 @@ class State:
             return replace(self, **{name: _copied(part) for name, part in vars(self).items()})
         for source, target in zip(self.arrays(), over.arrays(), strict=True):
             np.copyto(target, source)
-        return replace(over, step=self.step, starts=self.starts)
+        numbers = {name: getattr(self, name) for name in NUMBERS}
+        return replace(over, starts=self.starts, **numbers)
 
     def fits(self, other: State) -> bool:
         """Return whether both states can belong to the same scene. The data types and the shapes of
@@ -104,7 +113,7 @@ class State:
     def map(self, function: Callable[[Any], Any], starts: tuple[Any, ...]) -> State:
         """Return a state in which each array is replaced by the result of a function of it. The
         starts are replaced by `starts`."""
-        names = [each.name for each in fields(self) if each.name not in ("step", "starts")]
+        names = [each.name for each in fields(self) if each.name not in ("starts", *NUMBERS)]
         parts = {name: _mapped(function, getattr(self, name)) for name in names}
         return replace(self, starts=starts, **parts)
 
@@ -137,8 +146,11 @@ def unmoved_state(scene: Scene, cells: Sequence[int]) -> State:
     if scene.has_fracture:
         broken, lengths = np.full(bonds, -1, np.int32), np.zeros(bonds, precision)
     numbers = bond_numbers(experiment), particle_numbers(experiment)
-    values = (started(scene, *of) for of in zip(numbers, (bonds, sites), strict=True))
-    return State(0, u, previous, broken, lengths, (None,) * len(scene.leading), *values)
+    of_bonds, of_particles = (
+        started(scene, *of) for of in zip(numbers, (bonds, sites), strict=True)
+    )
+    starts = (None,) * len(scene.leading)
+    return State(0, u, previous, broken, lengths, starts, of_bonds, of_particles)
 
 
 def started(scene: Scene, numbers: Sequence[Remembered], shape: Sequence[int]) -> Values:
@@ -151,8 +163,10 @@ def started(scene: Scene, numbers: Sequence[Remembered], shape: Sequence[int]) -
 def initial_state(scene: Scene) -> State:
     """Return the state at time 0: the body has its initial displacements, frame points follow, and
     bonds across cracks and initial cuts are broken at step 0. The displacements of the previous
-    step are set equal to the initial ones."""
+    step are set equal to the initial ones. With a control the load factor is 0."""
     experiment, state = scene.experiment, unmoved_state(scene, scene.raster.shape[1:])
+    if experiment.solver.equilibrium.control:
+        state.load_factor = 0.0
     if not experiment.initial.at_rest:
         _displace(scene, state.u.reshape(scene.axes, -1))
         state.previous[...] = state.u
