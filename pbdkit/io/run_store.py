@@ -339,12 +339,12 @@ RECORDS = ".run-records"
 
 def store_of(output: Path) -> Path:
     """Return the path of the SQLite file of an unfinished run."""
-    return output.with_name(output.name + STORE)
+    return output.parent / (output.name + STORE)
 
 
 def records_of(output: Path) -> Path:
     """Return the path of the file with the large values of an unfinished run."""
-    return output.with_name(output.name + RECORDS)
+    return output.parent / (output.name + RECORDS)
 
 
 def remove_unfinished(output: Path) -> None:

@@ -197,6 +197,7 @@ WRONG = {
     "init of a shipped one": (2, ["init", "paper/f1"], "paper/f1: is the name of a shipped experiment, not a file; `pbdkit init f1.yaml --from paper/f1` copies it"),
     "init from no shipped one": (2, ["init", "--from", "paper/f3"], "paper/f3: is not a shipped experiment; did you mean 'paper/f2'?"),
     "no shipped experiment": (2, ["experiments", "f1"], "f1: is not a shipped experiment; `pbdkit experiments` lists them"),
+    "status of the root": (2, ["status", "/"], "/: is a folder, not a result of pbdkit"),
     "plot of nothing": (6, ["plot", "o.nc"], "o.nc: there is no such file"),
     "plot in no folder": (6, ["plot", "no/o.nc"], "no/o.nc: there is no such file"),
 }  # fmt: skip

@@ -95,7 +95,9 @@ def test_plot_accepts_any_experiment_name_and_refuses_other_files(told: Any) -> 
     assert told("plot", "result.yaml", "--set", "steps=3") == refused
 
 
-@pytest.mark.parametrize("command", ["plot", "animate", "curve", "export", "report", "explain"])
+@pytest.mark.parametrize(
+    "command", ["plot", "animate", "curve", "export", "report", "explain", "status", "resume"]
+)
 def test_directory_is_no_result(call: Any, command: str) -> None:
     assert call(command, ".").err == "pbdkit: .: is a folder, not a result of pbdkit\n"
 
