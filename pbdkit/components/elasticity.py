@@ -130,8 +130,9 @@ def bond_springs(slot: Slot, c: Stiffness, cells: Tiling) -> float:
     -----
     The springs of a cell are as stiff as possible under one condition: the stiffness of the cell
     minus that of its springs must be positive semidefinite. On squares of an isotropic material
-    with 0 ≤ ν ≤ 1/3 this remainder is a pure shear stiffness. The edges beside a straight cut
-    therefore carry the stress along the cut like half a cell.
+    with 0 ≤ ν ≤ 1/3 this remainder is a pure shear stiffness. An edge beside a straight cut then
+    has the stiffness 1/(2(1 + ν)). That is 1/(1 + ν) of the stiffness of half a cell under stress
+    along the cut: all of it at ν = 0, and 75 % at ν = 1/3.
     """
     x, y = slot.rest
     if cells.regular == 3:
