@@ -62,7 +62,7 @@ GROUPS = {
     "": "To start with",
     "material": "Calibrated materials",
     "modelling": "Loads, supports, contact and fracture",
-    "fracture": "Crack tips",
+    "fracture": "Crack tips and the load past its peak",
     "stability": "Oscillation",
     "paper": "The paper's cases",
 }

@@ -74,6 +74,7 @@ FEWER = {
     "animate": ["--every", "20"],
     "sweep": ["--workers", "1"],
     "run modelling/dogbone-to-failure": ["--set", "lattice.a=2.5"],
+    "run fracture/notched-beam": ["--set", "steps=4"],
     "run paper/f2": ["--set", "steps=60"],
     "run material/dogbone": ["--set", "steps=240", "--set", "fracture.failure=0.002"],
 }

@@ -67,6 +67,7 @@ SMALLER = {
         "diagnostics=[]",
         SWINGING_LONG,
     ],
+    "fracture/notched-beam": ["lattice.a=20.0", SWINGING_LONG],
     "modelling/dogbone-to-failure": ["lattice.a=2.5", SWINGING_LONG],
     "modelling/inclusion": ["lattice.a=1.0", SWINGING],
     "modelling/graded-bar": ["lattice.a=1.0", SWINGING],
