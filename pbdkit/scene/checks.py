@@ -38,8 +38,8 @@ MAX_DISTANCE = 2.0
 """A warning is issued if the distance of a selected point from the body exceeds this number of
 lattice spacings."""
 MAX_GAUGE_DISTANCE = 1.0
-"""The same limit for the points of diagnostics: no point between the particles of a body exceeds
-it."""
+"""A warning is issued if the distance of a point of a diagnostic from the body exceeds this number
+of lattice spacings. No point between the particles of a body exceeds it."""
 MAX_EXCESS = 2.0
 """A warning is issued if a section is wider than the body by more than this number of lattice
 spacings."""
