@@ -54,9 +54,9 @@ SMALLER = {
         "solver={type: stepping, memory: 0.97}",
     ],
     "fracture/crack-tip": [
-        "body={type: grid, columns: 25, rows: 29}",
-        "cuts=[{from: [10.0, 12.5], to: [15.0, 17.5]}]",
-        "leaders.1.select.nearest=[[12.0, 0.0]]",
+        "body={type: grid, columns: 13, rows: 15}",
+        "cuts=[{from: [5.0, 6.5], to: [8.0, 9.5]}]",
+        "leaders.1.select.nearest=[[6.0, 0.0]]",
         "diagnostics=[]",
         SWINGING_LONG,
     ],
