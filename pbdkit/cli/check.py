@@ -12,7 +12,7 @@ import numpy as np
 from pbdkit.model.boundary_conditions import Driven, LeaderGroup, Load
 from pbdkit.model.experiment import Experiment
 from pbdkit.model.solver import OpeningControl
-from pbdkit.plugin import RenewsParticles
+from pbdkit.plugin import RenewsParticles, UsesStiffness
 from pbdkit.plugin.units import BODY_FORCE, FORCE, Units, in_lengths
 from pbdkit.progress import waiting
 from pbdkit.scene.constants import signed_distance
@@ -121,6 +121,7 @@ def _run_rows(loaded: Experiment, scene: Scene, predicted: Forecast) -> Iterator
             )
             steps = "step" if len(steps_of_changes) == 1 else "steps"
             yield "equilibria", f"also before leaders or loads change, after {steps} {listed}{rest}"
+    yield from _fracture(scene)
     time = "" if predicted.seconds is None else f"{_seconds(predicted.seconds)} of stepping, "
     memory = f"{predicted.memory_mib:.3g} MiB of memory, {predicted.output_mib:.3g} MiB of output"
     yield "cost", f"{time}{memory} (estimates)"
@@ -132,6 +133,25 @@ def _described(experiment: Experiment, equilibria: str) -> str:
         quantity = "opening" if isinstance(control, OpeningControl) else "dissipated energy"
         return f"follows the branch of equilibria by the {quantity}; the load is an unknown"
     return f"computes the equilibrium directly{equilibria}; steps would converge to it"
+
+
+def _fracture(scene: Scene) -> Iterator[Row]:
+    """Yield a row with the length of the process zone and the largest lattice constants."""
+    fracture, rule = scene.experiment.fracture, scene.experiment.rule
+    if not isinstance(fracture, UsesStiffness):
+        return
+    limits = fracture.spacing_limits(rule, scene.setting)  # type: ignore[arg-type]  # calibrated
+    if limits is None:
+        return
+    a = scene.experiment.lattice.a
+    each = ", ".join(f"{angle:g}° {a * limit:.4g}" for angle, limit in limits.factors.items())
+    varies = " (fields of parameters have other values elsewhere)" * bool(fracture.varying)
+    yield (
+        "fracture",
+        f"process zone E G_c/f_t² = {limits.process_zone:.4g}, "
+        f"{limits.process_zone / a:.3g} lattice constants; largest lattice constant by the angle "
+        f"of the crack normal: {each}{varies}",
+    )
 
 
 def _row_of(title: str, groups: Iterable[str], limit: int | None) -> Iterator[Row]:

@@ -14,12 +14,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
-from pydantic import Discriminator, Field, Tag, model_validator
+from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
 from pydantic_core import PydanticCustomError
 
+from pbdkit.array_types import Floats
 from pbdkit.errors import ExperimentError
 from pbdkit.plugin import (
     FRACTURE_ENERGY,
@@ -39,6 +40,7 @@ from pbdkit.plugin import (
     Slot,
     Softens,
     SoftensCells,
+    SpacingLimits,
     StartsCracked,
     UsesStiffness,
     Vector,
@@ -46,9 +48,9 @@ from pbdkit.plugin import (
     squared_length,
     where,
 )
-from pbdkit.plugin.component import Drawn
+from pbdkit.plugin.component import Drawn, Pair
 from pbdkit.plugin.fracture_model import Segment
-from pbdkit.plugin.schedule import PLAIN, TIME_DEPENDENT, TimeDependent, at, form_of, last
+from pbdkit.plugin.schedule import PLAIN, TIME_DEPENDENT, WORD, TimeDependent, at, form_of, last
 from pbdkit.plugin.units import LENGTH, STRESS
 
 Limit = Annotated[float, Field(gt=0.0, le=1e150), LENGTH]
@@ -420,6 +422,117 @@ CROSSED = 0.09
 this number."""
 DIRECTIONS = 360
 """Number of crack directions for which the largest admissible lattice constant is computed."""
+LISTED = (0, 15, 30, 45, 90)
+"""Angles of crack normals for which `pbdkit check` prints the largest lattice constant."""
+MAX_LINES = 9
+"""Maximum number of straight parts of a softening law. The last one has the stress 0."""
+LOWEST = 1.0 / 64.0
+"""Ratio of stress to strength below which the law `exponential` ends in a straight line."""
+
+
+class SofteningLaw(NamedTuple):
+    """Ratio s of stress to strength as a function of the opening w of a crack: straight lines
+    between points.
+
+    Parameters
+    ----------
+    opening : (point,)
+        Openings x = w f_t / G_c.
+    stress : (point,)
+        Ratios s, which decrease from 1 to 0. The area under the law is 1.
+    """
+
+    opening: Floats
+    stress: Floats
+
+    @classmethod
+    def of(cls, points: Sequence[tuple[float, float]]) -> SofteningLaw:
+        """Return the law of given shape, scaled to the strength 1 and the area 1."""
+        x, s = np.array(points, float).T
+        s = s / s[0]
+        return cls(x / np.trapezoid(s, x), s)
+
+    @property
+    def slopes(self) -> Floats:
+        """Derivatives of s with respect to x between the points."""
+        return np.diff(self.stress) / np.diff(self.opening)
+
+    @property
+    def steepest(self) -> float:
+        """Largest rate at which s decreases with x."""
+        return float(-self.slopes.min())
+
+    def lines(self) -> dict[str, float]:
+        """Return the lines as numbers: line n begins at the opening `begin_n`, and on it s =
+        stress_n + slope_n x. `end` is the opening at which s = 0, and `stretch` its ratio to that
+        of the linear law."""
+        lines = np.zeros((3, MAX_LINES))
+        count, lines[0] = len(self.slopes), self.opening[-1]
+        lines[:, :count] = (
+            self.opening[:-1],
+            self.stress[:-1] - self.slopes * self.opening[:-1],
+            self.slopes,
+        )
+        numbered = {
+            f"{name}_{n}": float(value)
+            for name, values in zip(("begin", "stress", "slope"), lines, strict=True)
+            for n, value in enumerate(values)
+        }
+        end = float(self.opening[-1])
+        return {"lines": float(count), "end": end, "stretch": end / 2.0, **numbered}
+
+
+def _exponential() -> list[tuple[float, float]]:
+    """Return points of exp(-x). The deviation of each chord is the same. Below the stress `LOWEST`
+    a straight line has the area of the rest."""
+    stresses = np.linspace(1.0, math.sqrt(LOWEST), MAX_LINES - 1) ** 2
+    openings = -np.log(stresses)
+    return [*zip(openings, stresses, strict=True), (openings[-1] + 2.0, 0.0)]
+
+
+LAWS = {
+    "linear": SofteningLaw.of([(0.0, 1.0), (2.0, 0.0)]),
+    "bilinear": SofteningLaw.of([(0.0, 1.0), (0.8, 1.0 / 3.0), (3.6, 0.0)]),
+    "exponential": SofteningLaw.of(_exponential()),
+}
+"""Softening laws by name."""
+
+
+def _softening(points: tuple[Pair, ...]) -> tuple[Pair, ...]:
+    """Return the points of a softening law.
+
+    Raises
+    ------
+    ValueError
+        If openings do not increase from 0, or stresses do not decrease to 0.
+    """
+    x, s = np.array(points).T
+    if x[0] != 0.0 or np.any(np.diff(x) <= 0.0):
+        raise ValueError("openings should increase from 0: [[0, strength], ..., [opening, 0]]")
+    if not s[0] > 0.0 or s[-1] != 0.0 or s[-2] <= 0.0 or np.any(np.diff(s) > 0.0):
+        raise ValueError("stresses should decrease from the strength to 0, and be 0 once")
+    return points
+
+
+Points = Annotated[
+    tuple[Pair, ...],
+    Field(strict=False, min_length=2, max_length=MAX_LINES),
+    AfterValidator(_softening),
+]
+"""Type of the points of a softening law."""
+
+
+def _form_of_law(value: Any) -> str:
+    """Return the form of a law, `WORD` for a name or `PLAIN` for points."""
+    return WORD if isinstance(value, str) else PLAIN
+
+
+Law = Annotated[
+    Annotated[Literal["linear", "bilinear", "exponential"], Tag(WORD)]
+    | Annotated[Points, Tag(PLAIN)],
+    Discriminator(_form_of_law),
+]
+"""Type of a softening law."""
 
 
 class Cohesive(UsesStiffness, SoftensCells, Parting):
@@ -429,14 +542,21 @@ class Cohesive(UsesStiffness, SoftensCells, Parting):
     per unit length of the crack. The stress is the effective stress, that of the undamaged cell.
     When its largest principal value reaches the onset, the principal direction becomes the normal e
     of the crack in the cell and does not change any more. A bond with the unit vector n crosses the
-    crack if |n · e| > 0.3. The force of such a bond in the cell is reduced by the damage D =
-    failure / (failure - onset) (1 - onset / κ). Here κ is the principal stress divided by Young's
-    modulus, as the maximum over time. Other bonds of the cell are not damaged.
+    crack if |n · e| > 0.3. The force of such a bond in the cell is reduced by the damage D = 1 -
+    σ/κ. Here κ is the principal stress divided by Young's modulus, as the maximum over time, and σ
+    is the stress that the softening law has at the same strain. For the law `linear`, D = failure /
+    (failure - onset) (1 - onset / κ). Other bonds of the cell are not damaged.
 
-    The failure strain is computed from the energy: it is the strain at which a band of cells along
-    a straight crack has dissipated this energy, if the band does not contract along the crack. The
-    width of the band is the width of the cell along e (Bažant and Oh 1983, Oliver 1989). A bond is
-    broken when D = 1 in all cells beside it. Cracks do not close under compression.
+    The law is the stress as a function of the opening of the crack, w: `linear`; `bilinear`, with a
+    kink at a third of the strength and the opening 0.8 G_c / f_t (Petersson 1981); `exponential`;
+    or up to nine points [opening, stress]. Only the shape of the points matters: openings are
+    scaled such that the area under the law is the fracture energy, and stresses such that the first
+    is the strength.
+
+    The opening is the cracking strain of the cell times the width of the band, which is the width
+    of the cell along e (Bažant and Oh 1983, Oliver 1989). The strain at which the cell fails
+    follows from the energy if the band does not contract along the crack. A bond is broken when D =
+    1 in all cells beside it. Cracks do not close under compression.
     """
 
     type: Literal["cohesive"] = "cohesive"
@@ -453,9 +573,57 @@ class Cohesive(UsesStiffness, SoftensCells, Parting):
     )
     onset: StrainLimit = Field(
         description="Tensile strength over Young's modulus: the largest principal stress at which "
-        "a cell begins to soften.",
+        "a cell begins to soften. `strength` is another name of it, with a value that has a unit.",
         examples=[0.1],
     )
+    law: Law = Field(
+        "linear",
+        description="Stress as a function of the opening of the crack: a name, or points [opening, "
+        "stress], of which only the shape matters.",
+        examples=["bilinear", [[0, 1], [0.8, 0.3], [3.6, 0]]],
+    )
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _strength_with_unit(cls, data: Any, handler: Any) -> Any:
+        """Accept `strength` as another name of `onset`."""
+        if isinstance(data, dict) and "strength" in data:
+            text = ""
+            if "onset" in data:
+                text = "strength and onset are the same parameter; remove one of them"
+            elif isinstance(data["strength"], (int, float)):
+                text = (
+                    "a strength has a unit, as in 3.9 MPa; write the number without unit, strength "
+                    "/ Young's modulus, as onset"
+                )
+            if text:
+                raise PydanticCustomError("fault", "{text}", {"text": text, "key": "strength"})
+            data = {"onset" if key == "strength" else key: value for key, value in data.items()}
+        return handler(data)
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, core: Any, handler: Any) -> dict[str, Any]:
+        """Return the JSON Schema with `strength` as another name of `onset`."""
+        schema = super().__get_pydantic_json_schema__(core, handler)
+        own = handler.resolve_ref_schema(schema)
+        if "onset" in own.get("required", ()):
+            own["required"] = [name for name in own["required"] if name != "onset"]
+            own["oneOf"] = [{"required": ["onset"]}, {"required": ["strength"]}]
+            own["properties"]["strength"] = own["properties"]["onset"] | {
+                "title": "Strength",
+                "description": "Tensile strength with its unit; another name of `onset`.",
+                "examples": ["3.9 MPa"],
+            }
+        return schema
+
+    @property
+    def softening(self) -> SofteningLaw:
+        """Softening law."""
+        return LAWS[self.law] if isinstance(self.law, str) else SofteningLaw.of(self.law)
+
+    def parameters(self) -> dict[str, float]:
+        """Return the parameters of fictitious points, and the lines of the softening law."""
+        return {**super().parameters(), **self.softening.lines()}
 
     def constants(self, slot: Slot) -> dict[str, float]:
         """Return the value of `onset_strain`."""
@@ -478,17 +646,12 @@ class Cohesive(UsesStiffness, SoftensCells, Parting):
         """
         release, ratios = _material(rule)
         bonds = _bonds_of_a_cell(setting)
-        angles = np.arange(DIRECTIONS) * np.pi / DIRECTIONS
-        cos, sin = np.cos(2 * angles), np.sin(2 * angles)
-        size = np.sqrt(np.max([_projection(r, cos, sin) for r in bonds], axis=0))
-        flexibility, stiffness = (_along(cos, sin, *pair) for pair in (ratios[:2], ratios[2:]))
-        size = float((size / (flexibility * flexibility * stiffness)).max())
-        room = 2.0 * self.energy * release / (size * self.onset**2)
-        if np.any(room <= 1.0):
+        room = float(self._room(rule, setting, np.arange(DIRECTIONS) * np.pi / DIRECTIONS).min())
+        if room <= 1.0:
             raise ExperimentError(
-                f"{self.energy:g} is too small for this spacing: at the onset a cell stores "
-                f"{1.0 / room:.3g} times the energy that it dissipates, and the crack snaps from "
-                f"cell to cell; multiply the spacing by less than {room:.3g}, or set "
+                f"{self.energy:g} is too small for this spacing: a cell stores {1.0 / room:.3g} "
+                "times the elastic energy that its steepest softening can dissipate, and the crack "
+                f"snaps from cell to cell; multiply the spacing by less than {room:.3g}, or set "
                 f"fracture.onset below {self.onset * room**0.5:.3g} or fracture.energy above "
                 f"{self.energy / room:.3g}",
                 ("energy",),
@@ -498,6 +661,34 @@ class Cohesive(UsesStiffness, SoftensCells, Parting):
         names = ("along_y", "across", "stiff_y", "stiff_across")
         anisotropy = dict(zip(names, ratios, strict=True))
         return {"release": 2.0 * self.energy * release / self.onset, **anisotropy, **cell}
+
+    def spacing_limits(self, rule: Calibrated, setting: Setting) -> SpacingLimits:
+        """Return the largest lattice constants for cracks in some directions, and the length of the
+        process zone, E G_c / f_t²."""
+        angles = np.arange(DIRECTIONS) * 180.0 / DIRECTIONS
+        factors = self._room(rule, setting, np.radians(angles))
+        by_angle = dict(zip(angles.tolist(), factors.tolist(), strict=True))
+        worst = min(by_angle, key=by_angle.__getitem__)
+        return SpacingLimits(
+            self.energy / self.onset**2, {angle: by_angle[angle] for angle in (*LISTED, worst)}
+        )
+
+    def _room(self, rule: Calibrated, setting: Setting, angles: Floats) -> Floats:
+        """Return the largest admissible lattice constant, divided by that of the scene, for cracks
+        with normals at given angles.
+
+        With a larger lattice constant a cell would release more elastic energy than it dissipates,
+        so that its strain would have to decrease along the steepest part of the law.
+        """
+        release, ratios = _material(rule)
+        cos, sin = np.cos(2 * angles), np.sin(2 * angles)
+        bonds = _bonds_of_a_cell(setting)
+        size = np.sqrt(np.max([_projection(r, cos, sin) for r in bonds], axis=0))
+        flexibility, stiffness = (_along(cos, sin, *pair) for pair in (ratios[:2], ratios[2:]))
+        size = size / (flexibility * flexibility * stiffness)
+        steepest = self.softening.steepest
+        room: Floats = self.energy * release / (steepest * size * self.onset**2)
+        return room
 
     def remembered(self) -> tuple[Remembered, ...]:
         """Declare the damage and the failure strain of each bond in the cells on both sides.
@@ -514,8 +705,8 @@ class Cohesive(UsesStiffness, SoftensCells, Parting):
 
         If there is a cell on one side only, both sides have its values.
         """
-        left_damage, left_failure = _of_cell(left, c.damage_left, c.failure_left, r, c)
-        right_damage, right_failure = _of_cell(right, c.damage_right, c.failure_right, r, c)
+        left_damage, left_failure = _of_cell(left, c.damage_left, c.failure_left, r, c, p)
+        right_damage, right_failure = _of_cell(right, c.damage_right, c.failure_right, r, c, p)
         has_left, has_right = left.share > 0.0, right.share > 0.0
         return (
             where(has_left, left_damage, right_damage),
@@ -536,7 +727,7 @@ class Cohesive(UsesStiffness, SoftensCells, Parting):
         return (c.damage_left >= 1.0) & (c.damage_right >= 1.0)
 
 
-def _of_cell(stress: CellStress, damage: Any, failure: Any, r: Any, c: Any) -> Any:
+def _of_cell(stress: CellStress, damage: Any, failure: Any, r: Any, c: Any, p: Any) -> Any:
     """Return damage and failure strain of a bond in a cell under a stress."""
     largest, cos, sin = _principal(stress)
     flexibility = _along(cos, sin, c.along_y, c.across)
@@ -547,13 +738,42 @@ def _of_cell(stress: CellStress, damage: Any, failure: Any, r: Any, c: Any) -> A
     other = _projection(Vector(c.x2, c.y2), cos, sin)
     size = np.sqrt(where(other > size, other, size))
     stiffness = _along(cos, sin, c.stiff_y, c.stiff_across)
-    crack_failure = c.release * flexibility * flexibility * stiffness / size
+    crack_failure = c.release * flexibility * flexibility * stiffness / size * p.stretch
     crossed = _projection(r, cos, sin) > CROSSED * squared_length(r)
     begins = (failure == 0.0) & (strain > c.onset_strain) & (stress.share > 0.0)
     failure = where(begins, where(crossed, crack_failure, -crack_failure), failure)
     crosses = failure > 0.0
-    law = softened(strain, c.onset_strain, where(crosses, failure, 2.0 * c.onset_strain), damage)
-    return where(crosses, law, damage), failure
+    fails = where(crosses, failure, 2.0 * p.stretch * c.onset_strain)
+    return where(crosses, _damage(strain, c.onset_strain, fails, damage, p), damage), failure
+
+
+def _damage(strain: Any, onset: Any, failure: Any, damage: Any, p: Any) -> Any:
+    """Return the damage by the softening law, or the damage so far if that is larger.
+
+    With the opening x and the strain u of an elastic cell that x = 1 adds, strain = onset s(x) + u
+    x. On a line s = a + b x the stress onset s is therefore onset (a u + b strain) / (u + b onset),
+    and D = 1 - onset s / strain.
+    """
+    if p.lines == 1.0:
+        return softened(strain, onset, failure, damage)
+    u = failure / p.end
+    softens = strain > onset
+    size = where(softens, strain, 1.0)
+    law = 0.0 * size
+    for begin, a, b in (
+        (p.begin_0, p.stress_0, p.slope_0),
+        (p.begin_1, p.stress_1, p.slope_1),
+        (p.begin_2, p.stress_2, p.slope_2),
+        (p.begin_3, p.stress_3, p.slope_3),
+        (p.begin_4, p.stress_4, p.slope_4),
+        (p.begin_5, p.stress_5, p.slope_5),
+        (p.begin_6, p.stress_6, p.slope_6),
+        (p.begin_7, p.stress_7, p.slope_7),
+        (p.begin_8, p.stress_8, p.slope_8),
+    ):
+        on_line = 1.0 - onset * (a * u / size + b) / (u + b * onset)
+        law = where(strain >= onset * (a + b * begin) + u * begin, on_line, law)
+    return where(softens & (law > damage), law, damage)
 
 
 def _principal(stress: CellStress) -> tuple[Number, Number, Number]:

@@ -53,6 +53,7 @@ from pbdkit.plugin.fracture_model import (
     Segment,
     Softens,
     SoftensCells,
+    SpacingLimits,
     StartsCracked,
     UsesStiffness,
 )
@@ -130,8 +131,8 @@ __all__ = [
     "MixesCells", "Moment", "Nearness", "NeighbourMetric", "Number", "Numbers", "Offset", "Pair",
     "Parameters", "ParticleOperation", "Particles", "Quantity", "Remembered", "Remembers",
     "RenewsBonds", "RenewsParticles", "Segment", "Setting", "SharesParticles", "Slot", "Softens",
-    "SoftensCells", "SpaceVector", "StartsCracked", "Stiffness", "StoresEnergy", "Table",
-    "TearsCells", "Tiling", "Torn", "TouchingRows", "TurnsParticles", "UsesAngles", "UsesStiffness",
-    "Variable", "Vector", "Weights", "dot", "hookimpl", "interpolate", "length", "squared_length",
-    "where",
+    "SoftensCells", "SpaceVector", "SpacingLimits", "StartsCracked", "Stiffness", "StoresEnergy",
+    "Table", "TearsCells", "Tiling", "Torn", "TouchingRows", "TurnsParticles", "UsesAngles",
+    "UsesStiffness", "Variable", "Vector", "Weights", "dot", "hookimpl", "interpolate", "length",
+    "squared_length", "where",
 ]  # fmt: skip

@@ -178,6 +178,22 @@ class RenewsBonds(Remembers):
         """
 
 
+class SpacingLimits(NamedTuple):
+    """Lengths of a fracture model with a fracture energy, which `pbdkit check` prints.
+
+    Parameters
+    ----------
+    process_zone : float
+        Length E G_c / f_t² of the process zone, in lattice units.
+    factors : dict of float to float
+        Largest admissible lattice constant divided by that of the scene, by the angle of the
+        normal of a crack in degrees.
+    """
+
+    process_zone: float
+    factors: dict[float, float]
+
+
 class UsesStiffness(ABC):
     """A fracture model for calibrated rules.
 
@@ -207,6 +223,23 @@ class UsesStiffness(ABC):
         ExperimentError
             If the model cannot be combined with the rule.
         """
+
+    def spacing_limits(self, rule: Calibrated, setting: Setting) -> SpacingLimits | None:
+        """Return the limits of the lattice constant; None if there are none, the default.
+
+        Parameters
+        ----------
+        rule : Calibrated
+            Rule with an elasticity.
+        setting : Setting
+            Lattice and body.
+
+        Returns
+        -------
+        SpacingLimits or None
+            Limits, with the single numbers of parameters that vary.
+        """
+        return None
 
 
 class Softens(ABC):

@@ -8,6 +8,7 @@ import pytest
 from scene_strategies import in_turn
 
 import pbdkit
+from pbdkit.components.fracture import LAWS, SofteningLaw
 from pbdkit.plugin.lattice import signed_area
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.bond_breaking import Fracturing
@@ -137,6 +138,103 @@ def test_cell_has_onset_strength_and_fracture_energy(lattice, rule):
         assert given.broken > 0
 
 
+TABLE = [[0.0, 3.9], [0.01, 3.9], [0.02, 1.0], [0.05, 0.0]]
+"""Points of a law with a plateau, which is not convex, in MPa and mm."""
+
+
+@pytest.mark.parametrize("law", [*LAWS, TABLE], ids=[*LAWS, "table"])
+def test_cell_follows_its_softening_law(law):
+    """The traction at the opening w, the cracking strain times the width of the band, is that of
+    the law; the damage increases to 1, and the work is the energy."""
+    onset, energy = 1e-3, 6e-5
+    fracture = {"type": "cohesive", "energy": energy, "onset": onset, "law": law}
+    softening = LAWS[law] if isinstance(law, str) else SofteningLaw.of(law)
+    x, s = softening.opening, softening.stress
+    given = Strained(rule=ELASTIC | {"poisson_ratio": 0.0}, fracture=fracture)
+    openings = np.linspace(0.0, x[-1] * 1.01, 60)
+    expected = np.interp(openings, x, s)
+    strains = onset * expected + openings * energy / onset
+    tractions, damages = [], []
+    for strain in strains:
+        tractions.append(given.stress([[0.0, 0.0], [0.0, strain]])[1, 1])
+        damages.append(max(value.max() for value in given.state.bond_values[:2]))
+    np.testing.assert_allclose(tractions, onset * expected, atol=1e-12)
+    assert (np.diff(damages) >= 0.0).all()
+    assert damages[-1] == 1.0
+    assert given.broken > 0
+    assert np.trapezoid(s, x) == pytest.approx(1.0, abs=1e-14)
+
+
+def test_exponential_law_deviates_from_its_lines_by_one_per_cent():
+    x = np.linspace(0.0, np.log(64.0), 1000)
+    lines = np.interp(x, *LAWS["exponential"])
+    assert abs(lines - np.exp(-x)).max() < 0.01
+
+
+def test_bilinear_law_is_that_of_petersson():
+    np.testing.assert_allclose(LAWS["bilinear"], [[0.0, 0.8, 3.6], [1.0, 1 / 3, 0.0]], rtol=1e-15)
+
+
+@pytest.mark.parametrize("lattice", ["square", "hexagonal"])
+def test_law_of_two_points_is_linear(lattice):
+    """Its damage is computed by the same function. Three points on the line are another path of
+    the computation, with the same damage except for rounding errors."""
+    cells = [
+        Strained(rule=ELASTIC, lattice=lattice, body=GRID, fracture=COHESIVE | {"law": law})
+        for law in ("linear", [[0, 7], [3, 0]], [[0, 7], [1, 14 / 3], [3, 0]])
+    ]
+    for gradient in random_gradients(3):
+        linear, two, three = (given.stress(gradient) for given in cells)
+        assert np.array_equal(linear, two)
+        np.testing.assert_allclose(three, linear, atol=1e-15)
+    assert any((value > 0.0).any() for value in cells[0].state.bond_values)
+
+
+UNITS = {"length": "2 mm", "youngs_modulus": "30 GPa"}
+
+
+def test_strength_is_the_onset_with_a_unit():
+    for name in ("onset", "strength"):
+        fracture = {"type": "cohesive", name: "3.9 MPa", "energy": "143 N/m", "law": "bilinear"}
+        read = pbdkit.Experiment(**body(1.0, ELASTIC, fracture=fracture, units=UNITS)).fracture
+        assert read.law == "bilinear"
+        assert (read.onset, read.energy) == pytest.approx((1.3e-4, 143 / 30e9 / 2e-3), rel=1e-12)
+
+
+def refused(**fracture):
+    with pytest.raises(pbdkit.ExperimentError) as error:
+        pbdkit.Experiment(**body(1.0, fracture={"type": "cohesive", "energy": 0.1} | fracture))
+    return str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("fracture", "words"),
+    [
+        ({"strength": "1 MPa", "onset": 0.1}, "are the same parameter; remove one of them"),
+        ({"strength": 0.1}, "a strength has a unit, as in 3.9 MPa"),
+        ({"onset": 0.1, "law": [[0, 1], [1, 2], [2, 0]]}, "stresses should decrease"),
+        ({"onset": 0.1, "law": [[0, 1], [1, 0], [2, 0]]}, "and be 0 once"),
+        ({"onset": 0.1, "law": [[0.1, 1], [1, 0]]}, "openings should increase from 0"),
+        ({"onset": 0.1, "law": "concave"}, "should be 'linear', 'bilinear' or 'exponential'"),
+    ],
+)
+def test_wrong_laws_and_strengths_are_refused(fracture, words):
+    assert words in refused(**fracture)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_spacing_limits_are_those_of_the_refusal(law):
+    """The largest lattice constant in the worst direction is accepted, a larger one is refused."""
+    fracture = COHESIVE | {"law": law}
+    scene = build_scene(pbdkit.Experiment(**body(1.0, ELASTIC, fracture=fracture)))
+    limits = scene.experiment.fracture.spacing_limits(scene.experiment.rule, scene.setting)
+    assert limits.process_zone == pytest.approx(ENERGY / ONSET**2)
+    largest = min(limits.factors.values())
+    build_scene(pbdkit.Experiment(**body(0.999 * largest, ELASTIC, fracture=fracture)))
+    with pytest.raises(pbdkit.ExperimentError, match="too small for this spacing"):
+        build_scene(pbdkit.Experiment(**body(1.001 * largest, ELASTIC, fracture=fracture)))
+
+
 def random_gradients(seed, count=6, size=0.03):
     return size * np.random.default_rng(seed).normal(size=(count, 2, 2))
 
@@ -258,10 +356,11 @@ TORN = {
 }
 
 
-def test_kernels_soften_like_numpy(interpreted):
+@pytest.mark.parametrize("law", ["linear", "bilinear", "exponential"])
+def test_kernels_soften_like_numpy(interpreted, law):
     """One that softens is compiled in `testing/test_conformance`, which takes half a minute."""
     pytest.importorskip("numba")
-    fracture = {"type": "cohesive", "energy": 2e-3, "onset": 0.01}
+    fracture = {"type": "cohesive", "energy": 2e-3, "onset": 0.01, "law": law}
     found, known = (
         pbdkit.run(
             body(

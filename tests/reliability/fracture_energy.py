@@ -125,7 +125,7 @@ class Half:
     def load(self, fracture, cut, openings):
         """Yield the force and the damage of the cells at each opening, with equilibrium and
         softening in turn, for the requested openings; some bonds are `cut`."""
-        c, zero = constants(self.h, self.columns, fracture), np.zeros(self.columns - 1)
+        (c, p), zero = constants(self.h, fracture), np.zeros(self.columns - 1)
         numbers = dict.fromkeys(NUMBERS, zero)
         d = r = Vector(zero, zero + self.h)
         for opening in openings:
@@ -137,7 +137,7 @@ class Half:
                 pull = (strain + POISSON * along) / (1 - POISSON**2)
                 stress = CellStress(zero, pull, zero, zero + 1.0)
                 known = SimpleNamespace(**numbers, **c)
-                found = Cohesive.update(d, r, known, None, stress, stress)
+                found = Cohesive.update(d, r, known, p, stress, stress)
                 numbers = dict(zip(NUMBERS, found, strict=True))
                 if (numbers["damage_left"] - damage).max() < ENOUGH:
                     break
@@ -149,11 +149,12 @@ class Half:
         return np.concatenate([beside, damage])
 
 
-def constants(h, columns, fracture):
-    """Return the constants of upright bonds that `Cohesive` has in a scene of that spacing."""
+def constants(h, fracture):
+    """Return the constants of upright bonds and the parameters that `Cohesive` has in a scene of
+    that spacing."""
     scene = build_scene(Experiment(**PARTS, lattice={"type": "square", "a": h}, fracture=fracture))
     upright = next(s for s in scene.constants.limits if s.rest.x == 0.0)
-    return scene.constants.limits[upright]._asdict()
+    return scene.constants.limits[upright]._asdict(), scene.constants.fracture
 
 
 def beam(n, a=2.0, size=5.0, energy=1.0, far=1.8, count=24):
