@@ -12,7 +12,7 @@ import numpy as np
 from pbdkit.model.boundary_conditions import Driven, LeaderGroup, Load
 from pbdkit.model.experiment import Experiment
 from pbdkit.model.solver import OpeningControl
-from pbdkit.plugin import RenewsParticles, UsesStiffness
+from pbdkit.plugin import RenewsParticles, UsesStiffness, length
 from pbdkit.plugin.units import BODY_FORCE, FORCE, Units, in_lengths
 from pbdkit.progress import waiting
 from pbdkit.scene.constants import signed_distance
@@ -143,7 +143,7 @@ def _fracture(scene: Scene) -> Iterator[Row]:
     limits = fracture.spacing_limits(rule, scene.setting)  # type: ignore[arg-type]  # calibrated
     if limits is None:
         return
-    a = scene.experiment.lattice.a
+    a = min(float(length(slot.rest)) for slots in scene.neighbourhood.slots for slot in slots)
     each = ", ".join(f"{angle:g}° {a * limit:.4g}" for angle, limit in limits.factors.items())
     varies = " (fields of parameters have other values elsewhere)" * bool(fracture.varying)
     yield (

@@ -50,7 +50,16 @@ from pbdkit.plugin import (
 )
 from pbdkit.plugin.component import Drawn, Pair
 from pbdkit.plugin.fracture_model import Segment
-from pbdkit.plugin.schedule import PLAIN, TIME_DEPENDENT, WORD, TimeDependent, at, form_of, last
+from pbdkit.plugin.schedule import (
+    BY_NAME,
+    BY_POINTS,
+    PLAIN,
+    TIME_DEPENDENT,
+    TimeDependent,
+    at,
+    form_of,
+    last,
+)
 from pbdkit.plugin.units import LENGTH, STRESS
 
 Limit = Annotated[float, Field(gt=0.0, le=1e150), LENGTH]
@@ -523,13 +532,13 @@ Points = Annotated[
 
 
 def _form_of_law(value: Any) -> str:
-    """Return the form of a law, `WORD` for a name or `PLAIN` for points."""
-    return WORD if isinstance(value, str) else PLAIN
+    """Return the form of a law."""
+    return BY_NAME if isinstance(value, str) else BY_POINTS
 
 
 Law = Annotated[
-    Annotated[Literal["linear", "bilinear", "exponential"], Tag(WORD)]
-    | Annotated[Points, Tag(PLAIN)],
+    Annotated[Literal["linear", "bilinear", "exponential"], Tag(BY_NAME)]
+    | Annotated[Points, Tag(BY_POINTS)],
     Discriminator(_form_of_law),
 ]
 """Type of a softening law."""

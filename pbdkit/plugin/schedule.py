@@ -24,8 +24,12 @@ TIME_DEPENDENT = "time-dependent"
 """Form of a time-dependent number in the messages of pydantic."""
 WORD = "a number or 'auto'"
 """Form, in messages, of a number that can also be 'auto'."""
-FORMS = (PLAIN, TIME_DEPENDENT, WORD)
-"""Forms of numbers in messages."""
+BY_NAME = "by name"
+"""Form, in messages, of a law that is given by its name."""
+BY_POINTS = "by points"
+"""Form, in messages, of a law that is given by points."""
+FORMS = (PLAIN, TIME_DEPENDENT, WORD, BY_NAME, BY_POINTS)
+"""Forms of numbers and laws in messages."""
 
 
 class TimeDependent(Strict, Generic[Value]):
