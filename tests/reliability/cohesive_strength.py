@@ -1,6 +1,6 @@
 """Strength and energy of bars with a weak zone that are torn under `cohesive`.
 
-    python tests/reliability/cohesive_strength.py [square] [hexagonal] [--angle DEGREES]
+    python tests/reliability/cohesive_strength.py [square] [hexagonal] [--angle DEGREES] [--law LAW]
 
 A bar is pulled along x to beyond its failure under `solver: equilibrium`. In a zone one band of
 cells wide the onset is 1.5 % lower. The angle is that of the lattice's axis to the bar; bars along
@@ -29,6 +29,8 @@ RULES = {
     "springs": {"type": "springs"},
 }
 LENGTHS = (7, 30, 140, 500)
+LONGER = {"linear": 1.0, "bilinear": 2.0, "exponential": 3.2}
+"""Elongation at the end, by the softening law, over that of the linear law."""
 WEAK_ZONES = {
     ("square", 0.0): (-0.55, 0.55),
     ("square", 45.0): (-0.37, 1.08),
@@ -38,7 +40,7 @@ WEAK_ZONES = {
 bar meets one column of squares along their axis, and two rows if cells touch by corners."""
 
 
-def bar(lattice, rule, ell, angle=0.0, length=7.0, height=4.0, increments=36):
+def bar(lattice, rule, ell, angle=0.0, length=7.0, height=4.0, increments=36, law="linear"):
     """The experiment of a bar, and the force and the elongation of its recorded states."""
     turn = np.radians(angle)
     along, across = np.array([np.cos(turn), np.sin(turn)]), np.array([-np.sin(turn), np.cos(turn)])
@@ -51,7 +53,7 @@ def bar(lattice, rule, ell, angle=0.0, length=7.0, height=4.0, increments=36):
         return {"type": "polygon", "vertices": points}
 
     ends = length / 2 - 0.6
-    ways = np.array([1.1 * length, 2.3 * ell + length]) * ONSET
+    ways = np.array([1.1 * length, (2.3 * ell + length) * LONGER[law]]) * ONSET
     motion = {
         "type": "path",
         "steps": [increments // 2, increments],
@@ -74,6 +76,7 @@ def bar(lattice, rule, ell, angle=0.0, length=7.0, height=4.0, increments=36):
         "fracture": {
             "type": "cohesive",
             "energy": ell * ONSET**2,
+            "law": law,
             "onset": {
                 "otherwise": ONSET,
                 "weak": WEAK * ONSET,
@@ -115,10 +118,12 @@ def main() -> int:
     """One line a bar."""
     asked, held = sys.argv[1:], True
     angle = float(asked[asked.index("--angle") + 1]) if "--angle" in asked else 0.0
+    law = asked[asked.index("--law") + 1] if "--law" in asked else "linear"
+    bars = {} if law == "linear" else {"law": law, "length": 5.0, "height": 2.0, "increments": 40}
     for lattice in ("square", "hexagonal"):
         for name, rule in RULES.items() if lattice in asked else ():
             for ell in LENGTHS:
-                strength, energy, left = measured(lattice, rule, ell, angle)
+                strength, energy, left = measured(lattice, rule, ell, angle, **bars)
                 held &= abs(strength - 1) < 0.03
                 held &= abs(energy - 1) < 0.08 or lattice == "hexagonal" or angle != 0.0
                 print(
