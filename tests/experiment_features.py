@@ -32,6 +32,13 @@ LEFT_OUT = {
     "regions: grid": "is refused: a grid counts sites",
     "obstacles.motion: measured": "is refused: an obstacle is rigid",
     "obstacles.motion: newton": "is refused: an obstacle is rigid",
+    "fracture.law": "all laws are one function: components/test_fracture_cohesive",
+    "diagnostics: stress-intensity": "requires larger bodies: components/test_stress_intensity",
+    "diagnostics.tips": "is an option of `stress-intensity`",
+    "diagnostics.radius": "is an option of `stress-intensity`",
+    "solver.control: opening": "multiplies the whole load: equilibrium/test_branch",
+    "solver.control: dissipation": "multiplies the whole load: equilibrium/test_branch",
+    "solver.control.direction": "is an option of the control by an opening",
 }
 """Features that are not combined with others, and the reason."""
 MERGED = ("leaders.select.edge", "loads.select.edge")

@@ -627,7 +627,7 @@ class Cohesive(UsesStiffness, SoftensCells, Parting):
 
     @property
     def softening(self) -> SofteningLaw:
-        """Softening law."""
+        """Return the softening law."""
         return LAWS[self.law] if isinstance(self.law, str) else SofteningLaw.of(self.law)
 
     def parameters(self) -> dict[str, float]:
