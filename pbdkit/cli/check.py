@@ -12,7 +12,7 @@ import numpy as np
 from pbdkit.model.boundary_conditions import Driven, LeaderGroup, Load
 from pbdkit.model.experiment import Experiment
 from pbdkit.model.solver import OpeningControl
-from pbdkit.plugin import RenewsParticles, UsesStiffness, length
+from pbdkit.plugin import Calibrated, RenewsParticles, UsesStiffness, length
 from pbdkit.plugin.units import BODY_FORCE, FORCE, Units, in_lengths
 from pbdkit.progress import waiting
 from pbdkit.scene.constants import signed_distance
@@ -138,19 +138,20 @@ def _described(experiment: Experiment, equilibria: str) -> str:
 def _fracture(scene: Scene) -> Iterator[Row]:
     """Yield a row with the length of the process zone and the largest lattice constants."""
     fracture, rule = scene.experiment.fracture, scene.experiment.rule
-    if not isinstance(fracture, UsesStiffness):
+    if not (isinstance(fracture, UsesStiffness) and isinstance(rule, Calibrated)):
         return
-    limits = fracture.spacing_limits(rule, scene.setting)  # type: ignore[arg-type]  # calibrated
+    limits = fracture.spacing_limits(rule, scene.setting)
     if limits is None:
         return
     a = min(float(length(slot.rest)) for slots in scene.neighbourhood.slots for slot in slots)
-    each = ", ".join(f"{angle:g}° {a * limit:.4g}" for angle, limit in limits.factors.items())
+    size, unit = in_lengths(scene.experiment.units)
+    each = ", ".join(f"{n:g}° {size * a * limit:.4g}" for n, limit in limits.factors.items())
     varies = " (fields of parameters have other values elsewhere)" * bool(fracture.varying)
     yield (
         "fracture",
-        f"process zone E G_c/f_t² = {limits.process_zone:.4g}, "
-        f"{limits.process_zone / a:.3g} lattice constants; largest lattice constant by the angle "
-        f"of the crack normal: {each}{varies}",
+        f"process zone E G_c/f_t² = {size * limits.process_zone:.4g} {unit}, "
+        f"{limits.process_zone / a:.3g} lattice constants; largest lattice constant in {unit} by "
+        f"the angle of the crack normal: {each}{varies}",
     )
 
 

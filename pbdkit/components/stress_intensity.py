@@ -299,7 +299,7 @@ class StressIntensity(Diagnostic):
     are positive if the left lip moves along axis 2 and along axis 1 relative to the right lip. G =
     (K_I² + K_II²)/E' with E' = E in plane stress and E/(1 - ν²) in plane strain. T is the stress
     along the crack that remains at the tip. All values are NaN where there is no crack or no domain
-    of sufficient size; for anisotropic materials, all but J. Domains have a `radius` of 24 cells
+    of sufficient size; for anisotropic materials, all but J. Domains have a `radius` of 40 cells
     unless it is given. They become smaller if they would contain an edge, another crack, another
     material, loads, leaders or obstacles.
     """

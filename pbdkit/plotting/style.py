@@ -270,7 +270,8 @@ def takes_options(*without: str, dpi: int = PlotOptions.dpi) -> Callable[[F], F]
 
         entries = re.split(r"\n(?=    \w)", OPTIONS.strip("\n"))
         text = "\n".join(entry for entry in entries if entry.split()[0] not in without)
-        call.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]
+        signature = own.replace(parameters=parameters)
+        call.__signature__ = signature  # type: ignore[attr-defined]  # read by `inspect`
         call.__doc__ = (function.__doc__ or "").replace("    {options}", text)
         return cast(F, call)
 

@@ -117,6 +117,21 @@ def test_check_starts_with_groups_and_events(call: Call) -> None:
     assert "bonds      31" in whole
 
 
+def test_check_converts_the_limits_of_cohesive_fracture(call: Call) -> None:
+    """The process zone of 10 N/mm, 1000 MPa and 10 MPa is 100 mm in all units of length."""
+    parts = ["frame={type: natural}", "neighbours={type: chebyshev}"]
+    parts += ["rule={type: elastic, poisson_ratio: 0.3}"]
+    parts += ["fracture={type: cohesive, onset: 10 MPa, energy: 10 N/mm}"]
+    rows = []
+    for length, lengths in (("2 mm", 50.0), ("1 mm", 100.0)):
+        units = [f"units={{length: {length}, youngs_modulus: 1000 MPa, thickness: 1 mm}}"]
+        settings = [f"--set={part}" for part in parts + units]
+        rows.append(rows_of_check(call, "e.json", *settings)["fracture"].strip())
+        zone = f"process zone E G_c/f_t² = 100 mm, {lengths:g} lattice constants; "
+        assert rows[-1].startswith(zone + "largest lattice constant in mm")
+    assert rows[0].partition("; ")[2] == rows[1].partition("; ")[2]
+
+
 def test_check_lists_loads_and_regions(call: Call) -> None:
     said = rows_of_check(call, "modelling/composite-plate")
     assert said["regions"].strip() == "steel, 197 particles"
