@@ -563,16 +563,25 @@ class Barrier:
         Outline at the start, in the coordinates of the experiment.
     origin
         Position of site (0, 0) of the lattice.
+    spacing
+        Lattice constant.
     """
 
     group: Obstacle
     start: Outline
     origin: Floats
+    spacing: float
 
     @property
     def reference(self) -> Floats:
-        """Points of the outline at the start, (point, axis)."""
-        return self.start.points
+        """Points of the outline at the start, (point, axis).
+
+        The second point of a half-plane is one lattice constant away from the first.
+        """
+        points = self.start.points
+        if self.start.kind == HALF_PLANE:
+            return np.stack([points[0], points[0] + self.spacing * (points[1] - points[0])])
+        return points
 
     def offset(self, n: float) -> Floats:
         """Return the displacement of the motion, (point or 1, axis)."""
@@ -586,7 +595,7 @@ class Barrier:
         """
         if not self.group.leads(math.ceil(moment)):
             return None
-        offset = self.group.motion.offset(moment - self.group.from_ + 1, self.reference)
+        offset = self.group.motion.offset(moment - self.group.from_ + 1, self.start.points)
         return self.start.shifted(offset - self.origin)
 
 
@@ -612,8 +621,9 @@ def build_obstacles(raster: Raster, experiment: Experiment) -> tuple[Barrier, ..
             ("obstacles",),
         )
     origin, barriers = np.array(raster.lattice.origin, float), list[Barrier]()
+    spacing = math.hypot(*raster.cell.vectors[0])
     for n, obstacle in enumerate(experiment.obstacles):
-        barrier = Barrier(obstacle, outline_of(obstacle.shape), origin)
+        barrier = Barrier(obstacle, outline_of(obstacle.shape), origin, spacing)
         _refuse_infinite(barrier, experiment.steps, n)
         if obstacle.from_ == 1 and experiment.initial.at_rest:
             _refuse_body_inside(raster, barrier.start, n)

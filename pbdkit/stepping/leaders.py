@@ -31,6 +31,7 @@ from pbdkit.plugin.rule import material_of
 from pbdkit.scene.leader_groups import Guided, Leading, guided_at, has_guides, rotations_of
 from pbdkit.scene.obstacles import Barrier
 from pbdkit.scene.scene import Scene
+from pbdkit.scene.selection import spacing
 from pbdkit.stepping.contact import Contact, stiffnesses
 from pbdkit.stepping.followers import SlotFollowers
 from pbdkit.stepping.kernel import KernelWriter, Lines
@@ -321,7 +322,8 @@ def _refuse_contradiction(scene: Scene, leaders: Leaders, step: int) -> None:
     components = np.concatenate([a * size + at for at, _, axes in leaders for a in axes])
     u = np.concatenate([each.u.ravel() for each in leaders])
     order = np.argsort(components, kind="stable")
-    differs = np.abs(np.diff(u[order])) > 1e-9 * max(1.0, np.abs(u).max())
+    largest = max(spacing(scene.raster), np.abs(u).max())
+    differs = np.abs(np.diff(u[order])) > 1e-9 * largest
     clashes = np.flatnonzero((np.diff(components[order]) == 0) & differs)
     if len(clashes):
         place = components[order[clashes]].min(keepdims=True) % size

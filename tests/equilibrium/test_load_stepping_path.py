@@ -5,6 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from changed_axes import Change, changed
 from hypothesis import given, strategies as st
 from scene_strategies import in_turn, samples
 
@@ -222,3 +223,24 @@ def test_an_active_set_that_recurs_ends_the_search(columns, rise):
     with pytest.raises(UnconvergedError) as failed:
         follow_contact(finder_of(scene, state), state, 1.0)
     assert failed.value.error_bound.iterations < 30
+
+
+TURNED = {
+    "half_plane": {"half_plane": {"point": [1.0, -1.0], "normal": [0.6, 0.8]}},
+    "rectangle": {"type": "rectangle", "width": 20.0, "height": 2.0, "origin": [-1.0, -3.0]},
+    "disc": {"type": "disc", "radius": 2.0, "centre": [3.0, -4.0]},
+}
+
+
+@pytest.mark.parametrize("shape", TURNED)
+def test_the_tolerance_of_a_turning_obstacle_has_the_unit_of_lengths(shape):
+    turn = {"type": "rotation", "centre": [1.0, -1.0], "angle": 4.0, "steps": 4}
+    experiment = springs([0.0, 0.0], leaders=[HOLD])
+    experiment["obstacles"] = [{"shape": TURNED[shape], "motion": turn}]
+    written = pbdkit.Experiment(**experiment).model_dump(mode="json", by_alias=True)
+    tolerances = []
+    for unit in (1.0, 2.0**-40, 2.0**20):
+        scene = build_scene(pbdkit.Experiment(**changed(written, Change(unit))))
+        tolerances.append(finder_of(scene, initial_state(scene)).tolerance / unit)
+    assert tolerances[0] > 0.0
+    assert tolerances == pytest.approx([tolerances[0]] * 3, rel=1e-9)

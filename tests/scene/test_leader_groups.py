@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from changed_axes import Change, changed
 
 import pbdkit
 from pbdkit.equilibrium.load_stepping import equilibrium_state
@@ -241,8 +242,10 @@ def test_groups_contradict_each_other_only_on_a_common_axis():
         {"select": {"edge": "left"}, "motion": HOLD, "axes": ["x"]},
         {"select": {"edge": "left"}, "motion": turn, "from": 3, "axes": ["x"]},
     ]
-    with pytest.raises(pbdkit.ExperimentError, match="two groups move particle 2 differently"):
-        run(data)
+    written = pbdkit.Experiment(**data).model_dump(mode="json", by_alias=True)
+    for unit in (1.0, 2.0**-40, 2.0**40):
+        with pytest.raises(pbdkit.ExperimentError, match="two groups move particle 2 differently"):
+            run(changed(written, Change(unit)))
 
 
 @pytest.mark.parametrize(
