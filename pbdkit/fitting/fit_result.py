@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -26,7 +27,14 @@ from pbdkit.fitting.uncertainty import (
     combinations,
     youngs_modulus,
 )
+from pbdkit.io.sinks import MemorySink
+from pbdkit.model.experiment import Experiment
 from pbdkit.plugin.units import FORCE, LENGTH
+from pbdkit.scene.scene import build_scene
+from pbdkit.simulation import Simulation, record
+
+if TYPE_CHECKING:
+    import xarray
 
 
 @dataclass(frozen=True)
@@ -161,6 +169,42 @@ class Fitted:
     def noise(self) -> float:
         """Standard deviation of the noise of the first measurement."""
         return self.misfits[0].noise
+
+    @property
+    def experiment(self) -> Experiment:
+        """The experiment of the first measurement with the fitted values.
+
+        Each leader group with the motion `measured` has the displacements that were estimated, at
+        the positions of its particles. Parameters that are not identifiable have their initial
+        values. The experiment is complete: it can be run, changed, and stored as
+        ``json.dumps(experiment.model_dump(mode="json"))``, from which it can be loaded again.
+        """
+        return self.experiments[0]
+
+    @cached_property
+    def experiments(self) -> tuple[Experiment, ...]:
+        """The experiments of all measurements with the fitted values.
+
+        They differ by the `settings` of the measurements and by their estimated boundaries.
+        """
+        z = self.solution.z
+        return tuple(
+            experiment.of_parts(experiment.model_dump(mode="json", by_alias=True))
+            for experiment in (
+                observation.moved(self.problem.experiment_at(observation, z), z[own])
+                for observation, own in self.problem.own_slices()
+            )
+        )
+
+    @cached_property
+    def dataset(self) -> xarray.Dataset:
+        """The dataset of `experiment`, computed when it is first used.
+
+        Its last state is the equilibrium that the fit compares with a measured field.
+        """
+        memory = MemorySink()
+        record(Simulation.of_scene(build_scene(self.experiment)), memory)
+        return memory.dataset()
 
     def as_dict(self) -> dict[str, Any]:
         """Return the result as plain values, for JSON.

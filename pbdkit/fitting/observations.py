@@ -104,6 +104,7 @@ class Boundary:
             points=tuple(map(tuple, self.leading.reference.tolist())),
             displacements=tuple(map(tuple, full.tolist())),
             ramp=group.motion.ramp if isinstance(group.motion, Measured) else 1,
+            outside="nearest",
         )
         leaders = list(experiment.leaders)
         leaders[self.group] = group.model_copy(update={"motion": motion})
@@ -563,6 +564,10 @@ class Observation(ABC):
             If there is no prediction.
         """
 
+    def moved(self, experiment: Experiment, own_values: Floats) -> Experiment:
+        """Return the experiment in which measured boundaries have their estimated displacements."""
+        return experiment
+
     def modulus_terms(self, experiment: Experiment) -> tuple[float, float]:
         """Return two sums, of which the ratio is the initial modulus.
 
@@ -988,10 +993,7 @@ class FieldObservation(Observation):
         near: NearbyPrediction | None = None,
     ) -> FieldPrediction:
         """Predict the field in equilibrium."""
-        n = 0
-        for boundary in self.boundaries:
-            experiment = boundary.moved(experiment, own_values[n : n + boundary.size])
-            n += boundary.size
+        experiment, n = self.moved(experiment, own_values), self._coefficients
         previous = (
             near.prediction if near and isinstance(near.prediction, FieldPrediction) else None
         )
@@ -1023,6 +1025,14 @@ class FieldObservation(Observation):
             answering,
             away,
         )
+
+    def moved(self, experiment: Experiment, own_values: Floats) -> Experiment:
+        """Return the experiment in which boundaries have the displacements of coefficients."""
+        n = 0
+        for boundary in self.boundaries:
+            experiment = boundary.moved(experiment, own_values[n : n + boundary.size])
+            n += boundary.size
+        return experiment
 
     def _boundary_derivatives(self, resting_scene: RestingScene) -> tuple[Floats, ...]:
         """Return the derivatives of the displacements with respect to the coefficients of the

@@ -343,6 +343,13 @@ def test_measurement_may_have_its_own_settings(measured, tmp_path):
     )
     within(found)
     assert found.misfits[1].ratio < 0.5  # it has no noise
+    first, other = found.experiments
+    assert (first.leaders[1].motion.velocity, other.leaders[1].motion.velocity) == (
+        (0.02, 0.01),
+        (-0.01, 0.0),
+    )
+    assert first.rule == other.rule
+    assert first.rule.poisson_ratio == found.values["rule.poisson_ratio"].value
 
 
 def test_derivatives_match_finite_differences(measured):
