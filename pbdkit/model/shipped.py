@@ -49,7 +49,8 @@ def shipped_text(name: str) -> str:
 def shipped_data(name: str) -> list[Path]:
     """Return the data files that a shipped experiment refers to, from its folder."""
     text, files = shipped_text(name), (FOLDER / name).parent.iterdir()
-    return sorted(path for path in files if path.suffix != SUFFIX and path.name in text)
+    data = (path for path in files if path.suffix != SUFFIX and path.is_file())
+    return sorted(path for path in data if path.name in text)
 
 
 def shipped_title(name: str) -> str:
