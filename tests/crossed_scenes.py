@@ -330,10 +330,12 @@ def fits(features: Features) -> bool:
         name = name_of(part, features)
         if name and forms > len(NUMBERS.get(name, ())):
             return False
-    in_time = any(f"{part} in time" in features for part in ("rule", "fracture", "solver"))
+    changes = any(f"{part} in time" in features for part in ("rule", "fracture"))
+    in_time = changes or "solver in time" in features
     varies = not features.isdisjoint({*FIELDS_OF_RULE, *FIELDS_OF_FRACTURE, ANEW})
-    if "solver.engine: compiled" in features and in_time and varies:
-        return False  # kernels have either
+    pushes = any(f.startswith(("obstacles", "leaders.axes", *NEWTON)) for f in features)
+    if "solver.engine: compiled" in features and ((in_time and varies) or (changes and pushes)):
+        return False  # kernels have one of both
     if features >= {"solver in time", "solver.memory", "solver.relaxation"}:
         return False
     several = ("leaders.motion: ", "obstacles.shape: ", "obstacles.motion: ", "regions: ")
@@ -612,6 +614,8 @@ class _Writer:
             if self.has(f"fracture {form}"):
                 number = numbers.pop(0) if numbers else "failure"
                 written[number] = self.form(form, 1.5 * base[name].get(number, 1.0))
+        if laws := self.listed("fracture.law"):
+            written["law"] = laws[0]
         written |= {"scatter": 0.2} if self.has("fracture.scatter") else {}
         written |= {"placement": 1.02} if self.has("fracture.placement") else {}
         written |= {"frame_bonds": False} if self.has("fracture.frame_bonds") else {}

@@ -32,7 +32,7 @@ LEFT_OUT = {
     "regions: grid": "is refused: a grid counts sites",
     "obstacles.motion: measured": "is refused: an obstacle is rigid",
     "obstacles.motion: newton": "is refused: an obstacle is rigid",
-    "fracture.law": "all laws are one function: components/test_fracture_cohesive",
+    "fracture.law": "points are those of any law: components/test_fracture_cohesive",
     "diagnostics: stress-intensity": "requires larger bodies: components/test_stress_intensity",
     "diagnostics.tips": "is an option of `stress-intensity`",
     "diagnostics.radius": "is an option of `stress-intensity`",
