@@ -12,6 +12,7 @@ import scipy.linalg  # noqa: F401  # loaded before threads are limited
 from pbdkit.array_types import Floats
 from pbdkit.equilibrium.system import one_thread
 from pbdkit.errors import ExperimentError
+from pbdkit.fitting.derived import derive, refuse_other_names
 from pbdkit.fitting.fit_file import Fit
 from pbdkit.fitting.fit_result import Fitted, fitted
 from pbdkit.fitting.observations import FieldObservation, Observation
@@ -88,7 +89,9 @@ def _with_place(error: ExperimentError, experiment: Experiment) -> ExperimentErr
 def _fit(fit: Fit, experiment: Experiment, components: ComponentClasses) -> Fitted:
     if fit.sampler:
         refuse_no_sampler()
-    problem, solution = _solve(problem_of(fit, experiment, components=components), fit)
+    problem = problem_of(fit, experiment, components=components)
+    refuse_other_names(fit, problem)
+    problem, solution = _solve(problem, fit)
     names = [*fit.unknown]
     profiles = {
         path: profile_likelihood(problem, solution, names.index(path), fit.loss)
@@ -99,7 +102,13 @@ def _fit(fit: Fit, experiment: Experiment, components: ComponentClasses) -> Fitt
         fit, experiment, SolvedProblem(BASE_MODEL, problem, solution), components
     )
     result = fitted(fit, problem, solution)
-    return replace(result, profiles=profiles, sample=sample, candidates=candidates)
+    return replace(
+        result,
+        profiles=profiles,
+        sample=sample,
+        candidates=candidates,
+        derived=derive(fit, problem, solution),
+    )
 
 
 def _compare_candidates(

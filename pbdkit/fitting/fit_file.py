@@ -27,6 +27,7 @@ from pydantic import (
 
 from pbdkit.array_types import Floats
 from pbdkit.errors import ExperimentError, did_you_mean
+from pbdkit.fitting.formula import Formula
 from pbdkit.fitting.observations import (
     CurveObservation,
     FieldEvidence,
@@ -315,6 +316,14 @@ def _two(bounds: Pair) -> Pair:
 Bounds = Annotated[Pair, AfterValidator(_two)]
 
 
+def _formula(text: str) -> str:
+    Formula.read(text)
+    return text
+
+
+_Formula = Annotated[str, AfterValidator(_formula)]
+
+
 class Force(Strict):
     """The force of a leader group and the thickness of the body, from which Young's modulus is
     computed. Units are N, mm and MPa if the experiment has units. Otherwise the unit of the modulus
@@ -361,6 +370,10 @@ class Fit(Strict):
     profile likelihood is computed, by fitting all other parameters again. `sampler` generates
     samples of the posterior distribution. `candidates` are other models by name, which are compared
     with this one by cross-validation over a number of `folds`.
+
+    `derived` lists quantities that are computed from the fit with their standard errors: variables
+    of the experiment's diagnostics, for the equilibrium of the first measurement, and formulas of
+    them, of unknown parameters and of a fitted `youngs_modulus`.
     """
 
     version: Version = 1
@@ -374,6 +387,7 @@ class Fit(Strict):
     sampler: Sampler | None = None
     candidates: dict[str, AlternativeModel] = Field(default_factory=dict)
     folds: Annotated[int, Field(ge=2, le=20)] = 5
+    derived: Annotated[tuple[_Formula, ...], Field(strict=False)] = ()
 
     _files: FileResolver = FileResolver()
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pbdkit.array_types import Floats
+from pbdkit.fitting.derived import Derived
 from pbdkit.fitting.fit_file import Fit
 from pbdkit.fitting.observations import (
     CurveObservation,
@@ -151,6 +152,8 @@ class Fitted:
         Sample of the posterior; None if the fit does not request it.
     candidates : tuple of Candidate
         Compared models, the best one first; empty if the fit has no candidates.
+    derived : mapping of str to Derived
+        Quantities derived from the fit, by formula.
     """
 
     values: Mapping[str, Estimate]
@@ -164,6 +167,7 @@ class Fitted:
     combinations: tuple[Combination, ...] = ()
     sample: Sample | None = field(default=None, repr=False)
     candidates: tuple[Candidate, ...] = ()
+    derived: Mapping[str, Derived] = field(default_factory=dict)
 
     @property
     def noise(self) -> float:
@@ -200,11 +204,20 @@ class Fitted:
     def dataset(self) -> xarray.Dataset:
         """The dataset of `experiment`, computed when it is first used.
 
-        Its last state is the equilibrium that the fit compares with a measured field.
+        Its last state is the equilibrium that the fit compares with a measured field. Derived
+        quantities are the variables `derived_value`, `derived_error` and `derived_unit` along
+        `derived`, their formulas.
         """
         memory = MemorySink()
         record(Simulation.of_scene(build_scene(self.experiment)), memory)
-        return memory.dataset()
+        if not self.derived:
+            return memory.dataset()
+        estimates = [quantity.estimate for quantity in self.derived.values()]
+        columns = {
+            f"derived_{name}": ("derived", [getattr(estimate, name) for estimate in estimates])
+            for name in ("value", "error", "unit")
+        }
+        return memory.dataset().assign_coords(derived=[*self.derived]).assign(columns)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the result as plain values, for JSON.
@@ -233,6 +246,8 @@ class Fitted:
 
     def _on_request(self) -> dict[str, Any]:
         content: dict[str, Any] = {}
+        if self.derived:
+            content["derived"] = {name: entry.as_dict() for name, entry in self.derived.items()}
         if self.profiles:
             content["profiles"] = {path: entry.as_dict() for path, entry in self.profiles.items()}
         if self.sample:
@@ -374,6 +389,8 @@ class Fitted:
             yield f"{path}: {estimate}"
         if self.youngs_modulus:
             yield f"{MODULUS}: {self.youngs_modulus}"
+        for name, quantity in self.derived.items():
+            yield f"{name}: {quantity}"
         yield from map(str, self.combinations)
         for n, first in enumerate(self.values):
             for m, second in list(enumerate(self.values))[n + 1 :]:

@@ -114,18 +114,7 @@ def youngs_modulus(force: Force | None, problem: Problem, solution: Solution) ->
 def _modulus_from_force(force: Force, problem: Problem, solution: Solution) -> Estimate:
     """Return the ratio of the measured force per thickness to the group's force divided by
     Young's modulus, both along the measured force."""
-    direction = np.array(force.value) / np.hypot(*force.value)
-    count, prediction = len(problem.unknowns), solution.at.predictions[0]
-    assert isinstance(prediction, FieldPrediction)
-    reaction = GroupReaction(prediction.resting_scene, force.group)
-    unit, gradient = float(direction @ reaction.predicted), np.zeros(problem.size)
-    for n, (du, unknown) in enumerate(zip(prediction.changes, problem.unknowns, strict=True)):
-        gradient[n] = direction @ reaction.change(du, unknown.parameter)
-    reaction = GroupReaction(
-        prediction.answering, force.group
-    )  # The responses to boundary modes are those at this state.
-    for n, du in enumerate(prediction.answers, start=count):
-        gradient[n] = direction @ reaction.change(du)
+    unit, gradient = reaction_along(force, problem, solution)
     unidentified = [
         n
         for n, unknown_ in enumerate(problem.unknowns)
@@ -144,6 +133,24 @@ def _modulus_from_force(force: Force, problem: Problem, solution: Solution) -> E
     value = size / force.thickness / unit
     error = abs(value) * np.hypot(error_of_unit / unit, force.noise / size)
     return Estimate(value, float(error), identifiable=not is_affected)
+
+
+def reaction_along(force: Force, problem: Problem, solution: Solution) -> tuple[float, Floats]:
+    """Return the fitted force of a group along the measured force, divided by Young's modulus and
+    thickness, and its derivatives with respect to the unknowns, (unknown,)."""
+    direction = np.array(force.value) / np.hypot(*force.value)
+    count, prediction = len(problem.unknowns), solution.at.predictions[0]
+    assert isinstance(prediction, FieldPrediction)
+    reaction = GroupReaction(prediction.resting_scene, force.group)
+    unit, gradient = float(direction @ reaction.predicted), np.zeros(problem.size)
+    for n, (du, unknown) in enumerate(zip(prediction.changes, problem.unknowns, strict=True)):
+        gradient[n] = direction @ reaction.change(du, unknown.parameter)
+    reaction = GroupReaction(
+        prediction.answering, force.group
+    )  # The responses to boundary modes are those at this state.
+    for n, du in enumerate(prediction.answers, start=count):
+        gradient[n] = direction @ reaction.change(du)
+    return unit, gradient
 
 
 BLOCKS_PER_SIDE = 32
