@@ -461,6 +461,16 @@ class Prediction:
     by_own: Floats
     by_modulus: Floats
 
+    @property
+    def is_exact(self) -> bool:
+        """Return whether all derivatives are those at the values of the unknowns."""
+        return True
+
+    @property
+    def is_linear(self) -> bool:
+        """Return whether residuals are linear in the unknowns that only the observation has."""
+        return True
+
 
 @dataclass(frozen=True)
 class NearbyPrediction:
@@ -472,7 +482,8 @@ class NearbyPrediction:
         The prediction.
     away
         Largest difference between a parameter and its value in this prediction, as a fraction of
-        the interval between its bounds.
+        the interval between its bounds or, if these span more than an order of magnitude, of the
+        value.
     """
 
     prediction: Prediction
@@ -883,7 +894,7 @@ The resulting errors are far below any noise.
 CLOSE = 0.02
 """Largest change of parameters after which derivatives with respect to boundaries are reused.
 
-It is a fraction of the interval between the bounds. Residuals are exact in any case, and estimates
+It is a fraction as in `NearbyPrediction`. Residuals are exact in any case, and estimates
 change by at most this fraction of their errors.
 """
 
@@ -915,6 +926,16 @@ class FieldPrediction(Prediction):
     answers: tuple[Floats, ...] = field(repr=False)
     answering: RestingScene = field(repr=False)
     away: float = 0.0
+
+    @property
+    def is_exact(self) -> bool:
+        """Return whether the derivatives with respect to boundaries are those of this state."""
+        return self.away == 0.0
+
+    @property
+    def is_linear(self) -> bool:
+        """Return whether the equilibrium is linear in the displacements of boundaries."""
+        return self.resting_scene.finder.linear
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -133,6 +133,15 @@ class Unknown:
         """Return the interval between the bounds."""
         return self.high - self.low
 
+    @property
+    def is_wide(self) -> bool:
+        """Return whether the bounds span more than an order of magnitude."""
+        return self.low > 0.0 and self.high > WIDE * self.low
+
+    def scale_at(self, value: float) -> float:
+        """Return the scale of changes: the interval, or the value if the bounds are wide."""
+        return abs(value) if self.is_wide else self.span
+
 
 @dataclass(frozen=True)
 class Linearisation:
@@ -154,6 +163,16 @@ class Linearisation:
     residuals: Floats
     jacobian: Floats
     predictions: tuple[Prediction, ...]
+
+    @property
+    def is_exact(self) -> bool:
+        """Return whether no derivatives are those of a linearisation at other values."""
+        return all(prediction.is_exact for prediction in self.predictions)
+
+    @property
+    def is_linear(self) -> bool:
+        """Return whether residuals are linear in all unknowns except the parameters."""
+        return all(prediction.is_linear for prediction in self.predictions)
 
 
 @dataclass(frozen=True)
@@ -264,13 +283,17 @@ class Problem:
             experiment = unknown.parameter.put(experiment, float(value))
         return experiment
 
-    def at(self, z: Floats, near: Linearisation | None = None) -> Linearisation:
+    def at(
+        self, z: Floats, near: Linearisation | None = None, *, is_exact: bool = False
+    ) -> Linearisation:
         """Linearise the problem at z.
 
         Parameters
         ----------
         near
             Linearisation at similar values, which accelerates the solution.
+        is_exact
+            Whether derivatives of this linearisation are not reused.
 
         Raises
         ------
@@ -283,7 +306,7 @@ class Problem:
         count = sum(len(item.measured) for item in self.observations)
         jacobian, predictions, residuals = np.zeros((count, self.size)), [], np.zeros(count)
         modulus = float(z[len(parameters)]) if self.with_modulus else 1.0
-        guesses = self._near(near, z) if near else [None] * len(self.observations)
+        guesses = self._near(near, z, is_exact) if near else [None] * len(self.observations)
         entries = zip(self.rows(), self.own_slices(), guesses, strict=True)
         for (observation, rows), (_, section), guess in entries:
             experiment = self.experiment_at(observation, z)
@@ -311,12 +334,13 @@ class Problem:
         modulus = float(z[len(self.unknowns)]) if self.with_modulus else 1.0
         return part.at(self.experiment_at(part, z), (), own_values, modulus).residuals
 
-    def _near(self, at: Linearisation, z: Floats) -> list[NearbyPrediction]:
-        distances = [abs(z[n] - at.z[n]) / u.span for n, u in enumerate(self.unknowns)]
-        return [
-            NearbyPrediction(prediction, float(max(distances, default=0.0)))
-            for prediction in at.predictions
+    def _near(self, at: Linearisation, z: Floats, is_exact: bool) -> list[NearbyPrediction]:
+        distances = [
+            abs(z[n] - at.z[n]) / min(u.span, u.scale_at(at.z[n]))
+            for n, u in enumerate(self.unknowns)
         ]
+        away = np.inf if is_exact else float(max(distances, default=0.0))
+        return [NearbyPrediction(prediction, away) for prediction in at.predictions]
 
 
 Loss = Literal["linear", "soft_l1", "huber", "cauchy"]
@@ -330,13 +354,22 @@ MIN_COMPONENT = 0.3
 number."""
 AT_BOUND = 1e-6
 """Distance from a bound up to which a value is at the bound, relative to the interval."""
-MAX_ITERATIONS = 30
+MAX_ITERATIONS = 50
 """Maximum number of Gauss-Newton iterations."""
 
-MIN_STEP = 1e-3
-"""Minimum step length of the line search."""
-ARMIJO_C1 = 0.25
-"""Fraction of the predicted decrease of the cost that a step must achieve (Armijo)."""
+MIN_RADIUS = 1e-5
+"""Smallest radius of the trust region, relative to the scale of each parameter."""
+MIN_GAIN = 0.1
+"""Fraction of the predicted decrease of the cost that a step must achieve."""
+GOOD_GAIN = 0.7
+"""Fraction of the predicted decrease from which the trust region becomes larger."""
+SETTLED = 1e-3
+"""Relative decrease of the cost below which the linear unknowns are not changed."""
+STALLED = 0.1
+"""Largest step, in standard errors, of a fit that has converged if no step reduces the cost.
+
+It then is limited by the accuracy of the derivatives.
+"""
 
 SLACK = 1e-9
 """Relative increase of the cost that is treated as a rounding error."""
@@ -362,8 +395,6 @@ MODULUS = "Young's modulus"
 """Name of Young's modulus."""
 CONVERGED = 1e-2
 """Largest step, in standard errors, of a converged fit."""
-MAX_REVERSAL = 0.25
-"""Fraction of the previous step that a step may revert; otherwise its length is halved."""
 FROZEN = 1e-3
 """Change of all residuals between the bounds below which an unknown is fixed.
 
@@ -476,11 +507,11 @@ class Solution:
 
 
 def solved(problem: Problem, start: Floats, loss: Loss = "linear") -> Solution:
-    """Solve the problem by Gauss-Newton iterations with exact derivatives.
+    """Solve the problem by Gauss-Newton iterations in a trust region, with exact derivatives.
 
-    In each iteration the linearised problem with its loss is solved between the bounds. The
-    iteration ends when z has converged along all identifiable directions. Along all other
-    directions z has its initial values.
+    In each iteration the linearised problem with its loss is solved between the bounds and within
+    the trust region of the parameters. The iteration ends when z has converged along all
+    identifiable directions. Along all other directions z has its initial values.
 
     Parameters
     ----------
@@ -496,79 +527,162 @@ def solved(problem: Problem, start: Floats, loss: Loss = "linear") -> Solution:
 
     Notes
     -----
+    Residuals are linear in all unknowns except the parameters if the rule is linear. In each
+    iteration the cost is then minimised over these unknowns (variable projection), and the trust
+    region restricts the parameters only.
+
     The covariance is (JᵀJ)⁻¹. It is multiplied by the square of the ratio if residuals are larger
     than their noise (Birge). With a loss, it is that of M-estimators (Huber).
     """
     low, high = problem.bounds()
     z = np.clip(start, low, high)
-    at, count, length = problem.at(z), 1, 1.0
-    last_change = np.zeros(len(at.residuals))
+    region = _Region(problem, loss, np.full(len(z), np.inf))
+    at = region.linearise(z, None)
     for _ in range(MAX_ITERATIONS):
-        step = _linear_step(at, low - z, high - z, loss)
+        step = _linear_step(at, low - at.z, high - at.z, loss)
         directions, unidentified = _identify_directions(problem, at, loss)
-        ratio = spread_of(at.residuals, problem.size, loss)
-        if (np.abs(directions.errors(step)) <= CONVERGED).all():
+        remaining = np.abs(directions.errors(step)).max(initial=0.0)
+        trial = region.search(at) if remaining > CONVERGED else None
+        if trial is None:
             break
-        change = at.jacobian @ step
-        is_reversed = change @ last_change < -MAX_REVERSAL * (last_change @ last_change)
-        length = length / 2.0 if is_reversed else min(1.0, 2.0 * length)
-        length, at, trials = _line_search(problem, at, z, step, length, loss)
-        z, last_change, count = z + length * step, length * change, count + trials
-    else:
-        raise UnconvergedError(f"the fit has not converged after {MAX_ITERATIONS} iterations")
-    return Solution(z, at, directions, ratio, unidentified, _on_bounds(problem, z), count)
+        at = trial
+    if remaining > STALLED:
+        raise UnconvergedError(region.explain(at))
+    ratio = spread_of(at.residuals, problem.size, loss)
+    on_bounds = _on_bounds(problem, at.z)
+    return Solution(at.z, at, directions, ratio, unidentified, on_bounds, region.evaluations)
 
 
-def _line_search(
-    problem: Problem, at: Linearisation, z: Floats, step: Floats, length: float, loss: Loss
-) -> tuple[float, Linearisation, int]:
-    """Return a step length that reduces the cost sufficiently.
+@dataclass
+class _Region:
+    """Trust region of the parameters, a box about the current values.
 
-    Also return the linearisation after this step, and the number of trials.
+    Parameters
+    ----------
+    problem, loss
+        The problem and its loss.
+    others : (unknown,)
+        Largest changes of all other unknowns. They are infinite if these unknowns are linear.
+    radius
+        Half of the length of each side, relative to the scale of the parameter.
+    evaluations
+        Number of linearisations.
+    failure
+        Reason why there was no prediction at the last trial without one.
     """
-    cost = cost_of(at.residuals, loss)
-    gain = cost - cost_of(at.residuals - at.jacobian @ step, loss)
-    count = 0
-    while length >= MIN_STEP:
-        trial, count = _at(problem, z + length * step, at, length), count + 1
-        bound = cost * (1.0 + SLACK) - ARMIJO_C1 * length * gain
-        if trial is not None and cost_of(trial.residuals, loss) <= bound:
-            return length, trial, count
-        length /= 4.0
-    raise UnconvergedError(
-        "line search failed: no step reduces the cost; narrow the bounds, or start closer"
-    )
 
+    problem: Problem
+    loss: Loss
+    others: Floats
+    radius: float = 1.0
+    evaluations: int = 0
+    failure: Exception | None = None
 
-def _at(problem: Problem, z: Floats, near: Linearisation, length: float) -> Linearisation | None:
-    """Linearise at z; None if there is no prediction and a smaller step is possible."""
-    try:
-        return problem.at(z, near)
-    except UnconvergedError:
-        if length < 4.0 * MIN_STEP:
-            raise
+    def search(self, at: Linearisation) -> Linearisation | None:
+        """Return the linearisation after a step that reduces the cost, or None if there is none."""
+        (low, high), count = self.problem.bounds(), len(self.problem.unknowns)
+        cost = cost_of(at.residuals, self.loss)
+        while self.radius >= MIN_RADIUS:
+            sides = self._sides(at.z)
+            step = _linear_step(
+                at, np.maximum(low - at.z, -sides), np.minimum(high - at.z, sides), self.loss
+            )
+            gain = cost - cost_of(at.residuals - at.jacobian @ step, self.loss)
+            share = np.abs(step[:count] / sides[:count]).max(initial=0.0)
+            trial = self._try(at, step)
+            decrease = cost - cost_of(trial.residuals, self.loss) if trial else -np.inf
+            if trial and decrease >= MIN_GAIN * gain - SLACK * cost:
+                if decrease >= GOOD_GAIN * gain:
+                    self.radius = max(self.radius, 2.0 * share * self.radius)
+                    self.others = np.full(len(step), np.inf)
+                return trial
+            if not at.is_exact:
+                at = self.problem.at(at.z, at, is_exact=True)
+                self.evaluations += 1
+                continue
+            self.radius *= share / 4.0 if share else 0.25
+            if not at.is_linear:
+                self.others = np.abs(step) / 4.0
         return None
+
+    def linearise(self, z: Floats, near: Linearisation | None) -> Linearisation:
+        """Linearise at z, after minimisation over the unknowns that are not parameters.
+
+        This minimisation is omitted if residuals are not linear in these unknowns.
+        """
+        self.evaluations += 1
+        at = self.problem.at(z, near)
+        if not at.is_linear:
+            return at
+        free = np.full(len(z), np.inf)
+        free[: len(self.problem.unknowns)] = 0.0
+        step = _linear_step(at, -free, free, self.loss)
+        cost = cost_of(at.residuals, self.loss)
+        if cost - cost_of(at.residuals - at.jacobian @ step, self.loss) <= SETTLED * cost:
+            return at
+        self.evaluations += 1
+        return self.problem.at(z + step, at)
+
+    def _sides(self, z: Floats) -> Floats:
+        sides = self.others.copy()
+        for n, unknown in enumerate(self.problem.unknowns):
+            sides[n] = self.radius * unknown.scale_at(float(z[n]))
+        return sides
+
+    def _try(self, at: Linearisation, step: Floats) -> Linearisation | None:
+        """Linearise after a step; None if there is no prediction."""
+        try:
+            return self.linearise(at.z + step, at)
+        except (UnconvergedError, ExperimentError) as error:
+            self.failure = error
+            return None
+
+    def explain(self, at: Linearisation) -> str:
+        """Return why the fit has not converged, and a remedy."""
+        reason = f" ({self.failure})" if self.failure else ""
+        return f"no step reduces the cost{reason}; narrow the bounds, or start closer"
 
 
 def _linear_step(at: Linearisation, low: Floats, high: Floats, loss: Loss) -> Floats:
     """Solve the linearised problem between bounds by iteratively reweighted least squares."""
     size = np.linalg.norm(at.jacobian, axis=0)
     is_free = size * np.minimum(high - low, 1e100) > FROZEN
-    size = np.where(is_free, size, 1.0)
-    scaled, y = np.where(is_free, at.jacobian / size, 0.0), np.zeros(len(size))
+    size, low, high = size[is_free], low[is_free], high[is_free]
+    scaled, y = at.jacobian[:, is_free] / size, np.zeros(size.shape)
     for _ in range(1 if loss == "linear" else MAX_REWEIGHTINGS):
         weight = np.sqrt(_weight(at.residuals - scaled @ y, loss))
         basis, sizes, vectors = _singular(scaled * weight[:, None])
         projection = basis.T @ (at.residuals * weight)
         previous, y = y, vectors.T @ (projection / sizes)
         if (y < low * size).any() or (y > high * size).any():
-            from scipy.optimize import lsq_linear
-
             matrix = sizes[:, None] * vectors
-            y = lsq_linear(matrix, projection, (low * size, high * size), tol=1e-14).x
+            y = np.asarray(_solve_bounded(matrix, projection, low * size, high * size))
         if (np.abs(y - previous) <= STEADY).all():
             break
-    return np.asarray(y / size)
+    step = np.zeros(len(is_free))
+    step[is_free] = y / size
+    return step
+
+
+def _solve_bounded(matrix: Floats, values: Floats, low: Floats, high: Floats) -> Floats:
+    """Return the least-squares solution between bounds.
+
+    Unknowns without bounds are eliminated, because they may be many and nearly dependent.
+    """
+    from scipy.optimize import lsq_linear
+
+    is_bounded, y = np.isfinite(low) | np.isfinite(high), np.zeros(len(low))
+    others = matrix[:, ~is_bounded]
+    basis, *_ = _singular(others)
+    columns = matrix[:, is_bounded]
+    y[is_bounded] = lsq_linear(
+        columns - basis @ (basis.T @ columns),
+        values - basis @ (basis.T @ values),
+        (low[is_bounded], high[is_bounded]),
+        method="bvls",
+    ).x
+    y[~is_bounded] = np.linalg.lstsq(others, values - columns @ y[is_bounded], rcond=RANK)[0]
+    return y
 
 
 def _singular(columns: Floats) -> tuple[Floats, Floats, Floats]:
