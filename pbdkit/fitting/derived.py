@@ -4,8 +4,8 @@ A derived quantity is a formula f of the unknowns z: of parameters, of Young's m
 diagnostics of the fitted equilibrium. Its standard error is that of the linearised formula (delta
 method), var f = g · C g, with the gradient g of f and the covariance C of all unknowns, the
 displacements of measured boundaries included. Displacements depend linearly on these unknowns, or
-nearly so, and the derivatives ∂u/∂z are those of the fit. Central differences along ∂u/∂z are exact
-for quantities that are linear or quadratic in u.
+nearly so, and the derivatives ∂u/∂z are those of the fit, along which quantities are differentiated
+by differences.
 
 A diagnostic can have an error that does not depend on the data. If it has the variables `NAME` and
 `NAME_error`, the square of the latter is added to the variance of the former.
@@ -48,6 +48,9 @@ MAX_VALUES = 64
 """Maximum number of values of one derived quantity."""
 LARGEST_CHANGE = 2e-3
 """Largest displacement in a difference, in spacings of particles."""
+SMALL_CHANGE = 1e-3
+"""Change of an unknown in a difference, in standard errors. Errors of one-sided differences are
+then far below those of the data."""
 COMPLEX_STEP = 1e-30
 """Imaginary step with which formulas are differentiated, relative to the size of the value."""
 UNDETERMINED = 1e-6
@@ -280,38 +283,40 @@ class Response:
         """Return the equilibrium at the fitted values."""
         return self.prediction.resting_scene
 
+    def values(self, diagnostic: Diagnostic) -> list[Floats]:
+        """Return the variables of a diagnostic."""
+        return _measure(diagnostic, StateMoment(self.resting_scene.state, self._tables))
+
     def of(self, diagnostic: Diagnostic) -> tuple[list[Floats], list[Floats]]:
         """Return the variables of a diagnostic, and their derivatives, (..., unknown)."""
-
-        def measure(moment: Moment) -> list[Floats]:
-            return [np.asarray(v, float) for v in as_values(diagnostic.measure(moment), "measure")]
-
-        values = self._at(measure, self.resting_scene.scene, self.resting_scene.state.u)
+        values = self.values(diagnostic)
 
         def flat(moment: Moment) -> Floats:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", AccuracyWarning)
-                return np.concatenate([value.ravel() for value in measure(moment)])
+                return np.concatenate([value.ravel() for value in _measure(diagnostic, moment)])
 
         columns = np.stack([*self._columns(flat)], axis=1)
         shapes = [(*value.shape, self.problem.size) for value in values]
         parts = np.split(columns, np.cumsum([value.size for value in values])[:-1])
         return values, [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
 
-    def _at(self, function: Callable[[Moment], Any], scene: Scene, u: Floats) -> Any:
-        state = self.resting_scene.state.copy()
-        state.u = u
-        return function(StateMoment(state, Tables(scene)))
-
     def _columns(self, function: Callable[[Moment], Floats]) -> Iterator[Floats]:
         """Generate the derivatives with respect to each unknown."""
         problem, errors = self.problem, self.solution.errors
         scene, u = self.resting_scene.scene, self.resting_scene.state.u
-        zero = np.zeros_like(self._at(function, scene, u))
+        value = function(StateMoment(self.resting_scene.state, self._tables))
+
+        def along(du: Floats, error: float) -> Floats:
+            size = float(np.abs(du).max(initial=0.0))
+            largest = LARGEST_CHANGE * spacing_of(scene) / max(size, 1e-300)
+            step = min(SMALL_CHANGE * error or largest, largest)
+            return np.asarray((self._at(function, scene, u + step * du) - value) / step)
+
         for n, (unknown, du) in enumerate(
             zip(problem.unknowns, self.prediction.changes, strict=True)
         ):
-            yield self._along(function, du, float(errors[n])) + unknown.parameter.derivative(
+            yield along(du, float(errors[n])) + unknown.parameter.derivative(
                 scene.experiment,
                 lambda experiment: self._at(function, scene_like(scene, experiment), u),
                 DERIVATIVES,
@@ -320,22 +325,21 @@ class Response:
         for n in range(len(problem.unknowns), problem.size):
             is_boundary = 0 <= n - own.start < len(self.prediction.answers)
             yield (
-                self._along(function, self.prediction.answers[n - own.start], float(errors[n]))
+                along(self.prediction.answers[n - own.start], float(errors[n]))
                 if is_boundary
-                else zero
+                else np.zeros_like(value)
             )
 
-    def _along(self, function: Callable[[Moment], Floats], du: Floats, error: float) -> Floats:
-        """Return the derivative of a function along displacements, over one standard error."""
-        state, size = self.resting_scene.state, float(np.abs(du).max(initial=0.0))
-        largest = LARGEST_CHANGE * spacing_of(self.resting_scene.scene) / max(size, 1e-300)
-        step, ends = min(error or largest, largest), []
-        for sign in (1.0, -1.0):
-            moved = state.copy()
-            moved.u = state.u + sign * step * du
-            ends.append(function(StateMoment(moved, self._tables)))
-        return np.asarray((ends[0] - ends[1]) / (2.0 * step))
+    def _at(self, function: Callable[[Moment], Floats], scene: Scene, u: Floats) -> Floats:
+        state = self.resting_scene.state.copy()
+        state.u = u
+        tables = self._tables if scene is self.resting_scene.scene else Tables(scene)
+        return function(StateMoment(state, tables))
 
     @cached_property
     def _tables(self) -> Tables:
         return Tables(self.resting_scene.scene)
+
+
+def _measure(diagnostic: Diagnostic, moment: Moment) -> list[Floats]:
+    return [np.asarray(v, float) for v in as_values(diagnostic.measure(moment), "measure")]

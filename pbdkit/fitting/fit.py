@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ import scipy.linalg  # noqa: F401  # loaded before threads are limited
 from pbdkit.array_types import Floats
 from pbdkit.equilibrium.system import one_thread
 from pbdkit.errors import ExperimentError
+from pbdkit.fitting.crack_tip import locate_tip
 from pbdkit.fitting.derived import derive, refuse_other_names
 from pbdkit.fitting.fit_file import Fit
 from pbdkit.fitting.fit_result import Fitted, fitted
@@ -89,9 +91,13 @@ def _with_place(error: ExperimentError, experiment: Experiment) -> ExperimentErr
 def _fit(fit: Fit, experiment: Experiment, components: ComponentClasses) -> Fitted:
     if fit.sampler:
         refuse_no_sampler()
-    problem = problem_of(fit, experiment, components=components)
+    problem, located = problem_of(fit, experiment, components=components), None
     refuse_other_names(fit, problem)
-    problem, solution = _solve(problem, fit)
+    if fit.crack_tip:
+        solve = partial(_solve_with, fit, components)
+        problem, solution, located = locate_tip(fit.crack_tip, experiment, solve)
+    else:
+        problem, solution = _solve(problem, fit)
     names = [*fit.unknown]
     profiles = {
         path: profile_likelihood(problem, solution, names.index(path), fit.loss)
@@ -108,7 +114,21 @@ def _fit(fit: Fit, experiment: Experiment, components: ComponentClasses) -> Fitt
         sample=sample,
         candidates=candidates,
         derived=derive(fit, problem, solution),
+        crack_tip=located,
     )
+
+
+def _solve_with(
+    fit: Fit,
+    components: ComponentClasses,
+    experiment: Experiment,
+    change: Callable[[FieldObservation], FieldObservation],
+) -> tuple[Problem, Solution]:
+    """Fit an experiment after a change of its field observation."""
+    problem = problem_of(fit, experiment, components=components)
+    (observation,) = problem.observations
+    assert isinstance(observation, FieldObservation)
+    return _solve(replace(problem, observations=(change(observation),)), fit)
 
 
 def _compare_candidates(
@@ -153,7 +173,7 @@ def problem_of(
     ExperimentError
         If the experiment has no such parameters, or cannot predict the measurements.
     """
-    pairs = (unknown_bounds or fit.unknown).items()
+    pairs = (fit.unknown if unknown_bounds is None else unknown_bounds).items()
     unknowns = tuple(Unknown(Parameter(path), *bounds) for path, bounds in pairs)
     for unknown in unknowns:
         unknown.parameter.value_in(experiment)

@@ -52,6 +52,7 @@ from pbdkit.model.schema import DIALECT
 from pbdkit.model.solver import Equilibrium
 from pbdkit.model.validation import closed_part, fault, read_columns, report
 from pbdkit.plugin.component import Component, Strict
+from pbdkit.plugin.units import LENGTH
 from pbdkit.scene.scene import Scene, build_scene
 
 if TYPE_CHECKING:
@@ -335,6 +336,19 @@ class Force(Strict):
     noise: Annotated[float, Field(ge=0.0)] = 0.0
 
 
+class CrackTip(Strict):
+    """A crack tip with unknown position: one end of a cut in the experiment.
+
+    `cut` is the number of the cut, from 0, and `end` the one of its ends at which the tip is. The
+    tip is searched on the line of the cut, up to a distance `within` from this end, in lattice
+    units.
+    """
+
+    cut: Annotated[int, Field(ge=0)] = 0
+    end: Literal["from", "to"] = "to"
+    within: Annotated[float, Field(gt=0.0), LENGTH]
+
+
 class AlternativeModel(Strict):
     """Another model for the same data.
 
@@ -373,12 +387,13 @@ class Fit(Strict):
 
     `derived` lists quantities that are computed from the fit with their standard errors: variables
     of the experiment's diagnostics, for the equilibrium of the first measurement, and formulas of
-    them, of unknown parameters and of a fitted `youngs_modulus`.
+    them, of unknown parameters and of a fitted `youngs_modulus`. `crack_tip` is a crack tip with
+    an unknown position.
     """
 
     version: Version = 1
     experiment: Base
-    unknown: Annotated[dict[str, Bounds], Field(min_length=1)]
+    unknown: dict[str, Bounds]
     measured: Measurements
     force: Force | None = None
     modes: Annotated[int, Field(ge=0, le=40)] = 6
@@ -388,6 +403,7 @@ class Fit(Strict):
     candidates: dict[str, AlternativeModel] = Field(default_factory=dict)
     folds: Annotated[int, Field(ge=2, le=20)] = 5
     derived: Annotated[tuple[_Formula, ...], Field(strict=False)] = ()
+    crack_tip: CrackTip | None = None
 
     _files: FileResolver = FileResolver()
 
@@ -405,6 +421,8 @@ class Fit(Strict):
             raise ValueError(
                 "several measurements require the `noise` of each, which determines their weights"
             )
+        if self.crack_tip:
+            self._refuse_beside_tip()
         if self.force and not isinstance(self.measured[0], MeasuredField):
             raise ValueError(
                 "`force` is the force of a group in equilibrium while a field is measured; give "
@@ -419,6 +437,13 @@ class Fit(Strict):
             for measurement in self.measured
             if isinstance(measurement, MeasuredCurve) and not measurement.youngs_modulus
         ]
+        if not (
+            self.unknown or self.force or curves_without_modulus or self.derived or self.crack_tip
+        ):
+            raise ValueError(
+                "there is nothing to fit: without `unknown` parameters, give a `force` or a curve "
+                "for Young's modulus, `derived` quantities, or a `crack_tip`"
+            )
         if self.force and curves_without_modulus:
             raise ValueError(
                 "both `force` and a curve without `youngs_modulus` determine Young's modulus; "
@@ -432,6 +457,16 @@ class Fit(Strict):
         if self.sampler and self.sampler.walkers < 2 * len(self.unknown):
             raise ValueError("a `sampler` requires at least two walkers for each parameter")
         return self
+
+    def _refuse_beside_tip(self) -> None:
+        if len(self.measured) > 1 or not isinstance(self.measured[0], MeasuredField):
+            raise ValueError("`crack_tip` requires that the only measurement is a field")
+        for name in ("profile", "sampler", "candidates"):
+            if getattr(self, name):
+                raise ValueError(
+                    f"`{name}` is not available with `crack_tip`, since each position of the tip "
+                    "requires a fit; give the position that a fit with `crack_tip` reports"
+                )
 
 
 KIND = "strength"

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pbdkit.array_types import Floats
+from pbdkit.fitting.crack_tip import LocatedTip
 from pbdkit.fitting.derived import Derived
 from pbdkit.fitting.fit_file import Fit
 from pbdkit.fitting.observations import (
@@ -154,6 +155,8 @@ class Fitted:
         Compared models, the best one first; empty if the fit has no candidates.
     derived : mapping of str to Derived
         Quantities derived from the fit, by formula.
+    crack_tip : LocatedTip or None
+        Position of the crack tip, if it is unknown.
     """
 
     values: Mapping[str, Estimate]
@@ -168,6 +171,7 @@ class Fitted:
     sample: Sample | None = field(default=None, repr=False)
     candidates: tuple[Candidate, ...] = ()
     derived: Mapping[str, Derived] = field(default_factory=dict)
+    crack_tip: LocatedTip | None = None
 
     @property
     def noise(self) -> float:
@@ -248,6 +252,8 @@ class Fitted:
         content: dict[str, Any] = {}
         if self.derived:
             content["derived"] = {name: entry.as_dict() for name, entry in self.derived.items()}
+        if self.crack_tip:
+            content["crack_tip"] = self.crack_tip.as_dict()
         if self.profiles:
             content["profiles"] = {path: entry.as_dict() for path, entry in self.profiles.items()}
         if self.sample:
@@ -389,6 +395,8 @@ class Fitted:
             yield f"{path}: {estimate}"
         if self.youngs_modulus:
             yield f"{MODULUS}: {self.youngs_modulus}"
+        if self.crack_tip:
+            yield f"crack tip: {self.crack_tip}"
         for name, quantity in self.derived.items():
             yield f"{name}: {quantity}"
         yield from map(str, self.combinations)

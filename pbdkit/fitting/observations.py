@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from pbdkit.array_types import Floats, Indices
 from pbdkit.components.diagnostics import reactions
+from pbdkit.components.stress_intensity import Frame, IsotropicPlane, auxiliary
 from pbdkit.equilibrium.error_bound import UnconvergedError
 from pbdkit.errors import ExperimentError
 from pbdkit.fitting.parameter import Parameter
@@ -321,6 +322,28 @@ def _is_torn(scene: Scene, interpolation: Interpolation) -> NDArray[np.bool_]:
 
 
 @dataclass(frozen=True)
+class TipFields:
+    """Derivatives of the fields of modes I and II at a crack tip along the crack, ∂u/∂x₁.
+
+    Parameters
+    ----------
+    frame
+        Frame of the tip.
+    material
+        Material at the tip.
+    """
+
+    frame: Frame
+    material: IsotropicPlane
+
+    def at(self, points: Floats) -> Floats:
+        """Return both fields at points, (axis · point, mode), for stress intensity factors of 1 and
+        a Young's modulus of 1."""
+        gradient = auxiliary(self.frame.of(points), self.material)[1][:2, ..., 0]
+        return (gradient @ self.frame.axes).transpose(2, 1, 0).reshape(-1, 2)
+
+
+@dataclass(frozen=True)
 class FieldEvidence:
     """A measured field of displacements.
 
@@ -336,6 +359,9 @@ class FieldEvidence:
         Exponents of x and y of the distortions of ux and of uy.
     box
         Lower left and upper right corner of the points.
+    tip
+        Fields at a crack tip that the measured field contains in addition to the displacements of
+        the body, if the position of the tip is unknown.
     """
 
     points: Floats
@@ -343,6 +369,7 @@ class FieldEvidence:
     interpolation: Interpolation = field(repr=False)
     terms: tuple[tuple[tuple[int, int], ...], ...]
     box: tuple[Floats, Floats]
+    tip: TipFields | None = None
 
     @classmethod
     def of(
@@ -370,13 +397,15 @@ class FieldEvidence:
 
     @cached_property
     def distortions(self) -> Floats:
-        """Return the values of the polynomials of the distortions at the points.
+        """Return the values of the fields at a crack tip and of the polynomials of the distortions
+        at the points.
 
-        Coordinates are scaled so that they range from -1 to 1 in the box.
+        Coordinates of polynomials are scaled so that they range from -1 to 1 in the box.
         """
         low, high = self.box
         x, y = (2.0 * (self.points - low) / np.maximum(high - low, 1e-300) - 1.0).T
-        columns, n = [], len(x)
+        n = len(x)
+        columns = [*self.tip.at(self.points).T] if self.tip else []
         for axis, terms in enumerate(self.terms):
             for p, q in terms:
                 column = np.zeros(2 * n)
@@ -986,16 +1015,17 @@ class FieldObservation(Observation):
     @property
     def own_unknowns(self) -> int:
         """Return the number of coefficients and amplitudes."""
-        return self._coefficients + int(self.evidence.distortions.shape[1])
+        return self.coefficients + int(self.evidence.distortions.shape[1])
 
     @property
-    def _coefficients(self) -> int:
+    def coefficients(self) -> int:
+        """Return the number of coefficients of boundaries."""
         return sum(boundary.size for boundary in self.boundaries)
 
     def start(self) -> Floats:
         """Return the coefficients of the measured boundaries, and zeros for the distortions."""
         coefficients = [boundary.start(self.experiment.steps) for boundary in self.boundaries]
-        return np.concatenate([*coefficients, np.zeros(self.own_unknowns - self._coefficients)])
+        return np.concatenate([*coefficients, np.zeros(self.own_unknowns - self.coefficients)])
 
     def places(self) -> Floats:
         """Return the measured points."""
@@ -1014,7 +1044,7 @@ class FieldObservation(Observation):
         near: NearbyPrediction | None = None,
     ) -> FieldPrediction:
         """Predict the field in equilibrium."""
-        experiment, n = self.moved(experiment, own_values), self._coefficients
+        experiment, n = self.moved(experiment, own_values), self.coefficients
         previous = (
             near.prediction if near and isinstance(near.prediction, FieldPrediction) else None
         )

@@ -75,7 +75,8 @@ def _curve_size(count: int) -> tuple[float, float]:
 
 def _draw_field(figure: SubFigure, fitted: Fitted, n: int) -> None:
     field, information = fitted.field(n), fitted.information(n)
-    noise, largest = fitted.misfits[n].noise, max(t.max() for t in information.values())
+    noise = fitted.misfits[n].noise
+    largest = max((t.max() for t in information.values()), default=1.0)
     factor, unit = fitted.misfits[n].factor, fitted.misfits[n].unit
     counted = f" ({unit})" if unit else ""
     wide, count = _is_wide(fitted, n), 3 + len(information)
@@ -134,7 +135,7 @@ def _draw_curve(figure: SubFigure, fitted: Fitted, n: int) -> None:
     axes[2].plot(along, numbers.residual / fitted.misfits[n].noise, ".", markersize=3)
     axes[2].axhline(0.0, color="0.6", linewidth=0.8)
     titles = [what, "fitted over measured", "residual / noise"]
-    largest = max(t.max() for t in information.values())
+    largest = max((t.max() for t in information.values()), default=1.0)
     for ax, (path, sensitivity) in zip(axes[3:], information.items(), strict=False):
         ax.plot(along, sensitivity / largest, ".", markersize=3)
         titles.append(f"sensitivity to {path}")
