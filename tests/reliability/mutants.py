@@ -74,6 +74,8 @@ AREAS = {
     ],
     "equilibrium": [
         "equilibrium/newton.py",
+        "equilibrium/branch.py",
+        "equilibrium/cell_forces.py",
         "equilibrium/load_stepping.py",
         "equilibrium/system.py",
         "equilibrium/linearise.py",
@@ -295,16 +297,30 @@ def mutants_of(area: str, path: Path) -> dict[tuple[int, int], list[Mutant]]:
     return places
 
 
+def _order(seed: int, path: Path, places: Iterable[tuple[int, int]]) -> Iterator[str]:
+    """Yield a random number for each place in a file, which depends on the text of its line only:
+    after a change of the source elsewhere, the same places are drawn."""
+    lines = path.read_text().splitlines()
+    equal: Counter[tuple[str, int]] = Counter()
+    for line, column in places:
+        text = lines[line - 1]
+        place = text.strip(), column - len(text) + len(text.lstrip())
+        equal[place] += 1
+        named = f"{seed} {path.relative_to(ROOT)} {place} {equal[place]}"
+        yield hashlib.sha256(named.encode()).hexdigest()
+
+
 def drawn(count: int, seed: int, areas: Sequence[str]) -> list[Mutant]:
     """Draw places in the source of each area at random, and at each place one mutant."""
     mutants = []
     for number, area in enumerate(areas):
-        rng = random.Random(f"{seed} {area}")
         paths = sorted(p for part in AREAS[area] for p in (ROOT / "pbdkit").glob(part))
-        places = [choices for path in paths for choices in mutants_of(area, path).values()]
+        ranked: list[tuple[str, list[Mutant]]] = []
+        for path in paths:
+            places = mutants_of(area, path)
+            ranked += zip(_order(seed, path, places), places.values(), strict=True)
         share = count // len(areas) + (number < count % len(areas))
-        chosen = rng.sample(places, min(share, len(places)))
-        mutants += [rng.choice(choices) for choices in chosen]
+        mutants += [random.Random(n).choice(choices) for n, choices in sorted(ranked)[:share]]
     return mutants
 
 
