@@ -1,0 +1,159 @@
+"""Two ways to the linear system of a scene: stencils with multigrid, and a matrix with factors."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import pbdkit
+from pbdkit.equilibrium.lattice_system import SlowMode, lattice_system
+from pbdkit.equilibrium.sparse import MatrixSystem
+from pbdkit.equilibrium.stencil_matrix import (
+    LED,
+    StencilMatrix,
+    differenced_matrix,
+    stencil_matrix,
+)
+from pbdkit.equilibrium.system import Moves, random_displacements
+from pbdkit.progress import Watch
+from pbdkit.scene.scene import build_scene
+from pbdkit.stepping.state import initial_state
+from tests.equilibrium.test_multigrid import PULL, SCENES, Skew, sheet
+
+pytest.importorskip("numba")
+SMALL = {"type": "grid", "columns": 30, "rows": 14}
+LINEAR = {
+    name: SCENES[name] | {"body": SMALL}
+    for name in ("elastic", "rectangular", "hexagonal", "oblique", "mirror")
+}
+LINEAR["a rule of one's own"] = sheet(rule=Skew(), frame={"type": "none"}, body=SMALL)
+LINEAR["barycentre"] = SCENES["barycentre of eight, free"] | {"body": SMALL}
+
+
+def at_rest(given):
+    """Return the scene and its state at rest."""
+    scene = build_scene(pbdkit.Experiment(**given))
+    state = initial_state(scene)
+    return scene, replace(state, u=np.zeros_like(state.u))
+
+
+def blocks(matrix: StencilMatrix, with_leaders: bool):
+    """Return the stencils of all followers, (place, 9, 2, 2), and the scales, (place, 2, 2).
+    Entries of leaders are zero unless `with_leaders`."""
+    places = np.argwhere(matrix.code >= 0)
+    code = matrix.code[tuple(places.T)]
+    stencils = matrix.stencils[code].reshape(-1, 9, 2, 2).copy()
+    for s in range(9):
+        beside = tuple((places + np.array([s // 3 - 1, s % 3 - 1])).T)
+        stencils[(matrix.kind[beside] == LED) & (not with_leaders), s] = 0.0
+    return stencils, matrix.scale[code].reshape(-1, 2, 2)
+
+
+@pytest.mark.parametrize("name", LINEAR)
+def test_differences_of_moves_give_the_same_stencils_as_derivatives(name):
+    """K of derivatives is the row scale times A of differences, except that frame points beside
+    leaders are not part of K."""
+    scene, rest = at_rest(LINEAR[name])
+    derived = stencil_matrix(scene, rest, 1)
+    differenced = differenced_matrix(scene, rest, 1, Moves(scene))
+    np.testing.assert_array_equal(derived.code < 0, differenced.code < 0)
+    np.testing.assert_array_equal(derived.kind, differenced.kind)
+    with_leaders = scene.frame is None
+    (K, scale), (A, ones) = (blocks(m, with_leaders) for m in (derived, differenced))
+    np.testing.assert_array_equal(ones, np.broadcast_to(np.eye(2), ones.shape))
+    expected = np.einsum("pij,psjk->psik", scale, A)
+    np.testing.assert_allclose(K, expected, rtol=0, atol=1e-6 * np.abs(K).max())
+
+
+TOLERANCE = 1e-9
+
+
+def assert_near(found, exact):
+    np.testing.assert_allclose(found, exact, rtol=0, atol=10 * TOLERANCE * np.abs(exact).max())
+
+
+def longest(u):
+    return np.sqrt((u**2).sum(axis=0)).max()
+
+
+@pytest.mark.parametrize("name", LINEAR)
+def test_solutions_by_grids_are_those_of_the_matrix(name):
+    """Both systems are A c = moves(0) - moves(c), and grids take few iterations. Transposed
+    solutions satisfy λ · moves = weights · c."""
+    scene, rest = at_rest(LINEAR[name])
+    grids = lattice_system(scene, rest, 1, Watch())
+    assert grids.methods.startswith("multigrid")
+    assert grids.iterations == 0
+    moves, exact = Moves(scene), random_displacements(scene, 1.0)
+    weights = exact[::-1].copy()
+    still, moved = (moves.at(replace(rest, u=u.copy()), 1) for u in (rest.u, exact))
+    load, near = still - moved, [0.3 * exact + 0.1 * weights, weights]
+    for system in (grids, MatrixSystem(scene, rest, "lu", Watch(), 1)):
+        assert_near(system.solve(load, TOLERANCE), exact)
+        assert system.iterations <= 18
+        assert_near(system.answer(load, TOLERANCE), exact)
+        before = system.iterations
+        assert_near(system.answer(load, TOLERANCE, near), exact)
+        assert system.iterations - before <= 4
+        assert system.mismatch(exact, still, moved) <= 1e-9
+        assert system.mismatch(exact, still, still) == pytest.approx(1.0)
+        product = (system.solve_transposed(weights, TOLERANCE) * load).sum()
+        assert product == pytest.approx((weights * exact).sum(), rel=1e-7)
+        assert system.is_stable()
+
+
+@pytest.mark.parametrize("name", LINEAR)
+def test_bounds_of_both_systems_are_near_the_distance(name):
+    """The effect of rounding is that of moves of this size, up to their signs."""
+    scene, rest = at_rest(LINEAR[name])
+    grids, factors = (
+        lattice_system(scene, rest, 1, Watch()),
+        MatrixSystem(scene, rest, "lu", Watch(), 1),
+    )
+    force = np.where(random_displacements(scene, 1.0) != 0.0, 1.0, 0.0)
+    length = longest(factors.solve(force, TOLERANCE))
+    for system in (grids, factors):
+        bound = system.distance(force, 0.0)
+        assert length * (1 - 1e-9) <= bound <= 1.5 * length
+        assert 0.15 * length <= system.distance(force, 1.0) - bound <= 2.0 * length
+    for _ in range(2):  # The bound does not depend on earlier ones.
+        assert grids.distance(force, 0.0) == pytest.approx(grids.distance(0.5 * force, 0.0) * 2)
+
+
+@pytest.mark.parametrize("name", LINEAR)
+def test_the_slowest_mode_is_estimated_on_coarser_grids(name):
+    scene, rest = at_rest(LINEAR[name])
+    grids, factors = (
+        lattice_system(scene, rest, 1, Watch()),
+        MatrixSystem(scene, rest, "lu", Watch(), 1),
+    )
+    mode = SlowMode(random_displacements(scene, 1.0), 1.0)
+    for _ in range(40):
+        mode = mode.improved(factors, 1e-9)
+    estimate = grids.slowest()
+    assert mode.slowness / 4 <= estimate.slowness <= mode.slowness * 4
+    if "conjugate" in grids.methods:
+        better = estimate.improved(grids, 1e-3).improved(grids, 1e-3)
+        assert better.slowness == pytest.approx(mode.slowness, rel=5e-3)
+
+
+@pytest.mark.parametrize("name", LINEAR)
+def test_displacements_of_leaders_cause_the_moves_of_the_scene(name):
+    """The coupling is stored unless frame points or several sites of a cell take part."""
+    scene, rest = at_rest(LINEAR[name])
+    led = np.zeros_like(rest.u).reshape(2, -1)
+    for leading in scene.leading:
+        led[:, leading.place] = np.random.default_rng(0).normal(size=(2, len(leading.place)))
+    led, moves = led.reshape(rest.u.shape), Moves(scene)
+    found = lattice_system(scene, rest, 1, Watch()).pushed_by(led)
+    if name in ("oblique", "mirror", "hexagonal"):
+        assert found is None
+        return
+    still, moved = (moves.at(replace(rest, u=u.copy()), 1) for u in (rest.u, led))
+    np.testing.assert_allclose(found, moved - still, rtol=0, atol=1e-12)
+
+
+def test_constrained_components_have_no_coupling_to_leaders():
+    below = {"select": {"box": [5.5, -1.0, 20.5, 0.5]}, "motion": {"type": "hold"}, "axes": ["y"]}
+    scene, rest = at_rest(LINEAR["elastic"] | {"leaders": [*PULL, below]})
+    assert lattice_system(scene, rest, 1, Watch()).pushed_by(rest.u) is None
