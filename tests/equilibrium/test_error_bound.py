@@ -1,6 +1,7 @@
 """solver.settle ends a run where it is certainly near equilibrium, never before, hardly after."""
 
 import json
+import math
 import re
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from scene_strategies import experiments, in_turn, samples
 
 import pbdkit
 from pbdkit.cli import program
+from pbdkit.equilibrium.error_bound import Pace
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state
@@ -492,3 +494,49 @@ def test_momentum_displacement_counts_as_distance(memory):
     last = np.abs((ds.position[-1] - ds.position[-2]).values).max()
     assert ds.attrs["status"] == "settled"
     assert error_bound(ds)["distance"] >= memory / (1.0 - memory) * last
+
+
+def first_bound(lengths, tolerance, begin, most=10**6):
+    """Return the steps of the checks of a schedule up to the first bound, from the length of each
+    step after step `begin`."""
+    pace, checks = Pace(begin + 1, tolerance, begin), []
+    while pace.next_look - begin < most:
+        checks.append(pace.next_look - begin)
+        length = lengths(checks[-1])
+        if pace.is_near(pace.next_look, length, length):
+            return checks, pace
+    return checks, pace
+
+
+@pytest.mark.parametrize("ratio", [0.5, 0.9, 0.99, 0.9999])
+@pytest.mark.parametrize("tolerance", [1e-3, 1e-9])
+def test_checks_find_the_end_of_a_single_mode(ratio, tolerance):
+    """The distance after step n of a mode that decays by a factor ρ is ρ / (1 - ρ) times the length
+    of step n, so that the step of the first bound is known. The number of checks is that of a few
+    increases by a quarter."""
+    checks, pace = first_bound(lambda n: ratio**n, tolerance, 0)
+    steps = math.log(tolerance * (1.0 - ratio) / ratio) / math.log(ratio)
+    first = max(2, math.ceil(max(steps, math.log(2.0 * tolerance) / math.log(ratio)) - 1e-6))
+    assert first <= checks[-1] <= first + max(1, first // 200)
+    assert len(checks) <= 8 + math.log(first) / math.log(1.25)
+    later, _ = first_bound(lambda n: ratio**n, tolerance, 5000)
+    assert later == checks
+    # The bound is a hundred times larger than the tolerance, as if a slower mode remained.
+    pace.note_distance(pace.next_look, 100.0 * tolerance)
+    wanted = checks[-1] + math.log(100.0) / -math.log(ratio)
+    assert pace.next_look <= math.ceil(min(wanted, checks[-1] + max(1, checks[-1] // 4)))
+    assert pace.next_look > checks[-1]
+
+
+def test_a_body_that_stops_is_at_its_end():
+    checks, _ = first_bound(lambda n: 1.0 if n < 40 else 0.0, 1e-6, 7)
+    assert 40 <= checks[-1] <= 51
+
+
+def test_steps_that_do_not_decrease_are_followed_by_a_bound_all_the_same():
+    """The bound is computed after four times the steps that were needed for short ones."""
+    checks, _ = first_bound(lambda n: 1.0 if n < 100 else 1e-6, 1e-6, 3)
+    short = next(n for n in checks if n >= 100)
+    assert 4 * short <= checks[-1] <= 5.1 * short
+    endless, _ = first_bound(lambda n: 1e-5, 1e-6, 0, most=2000)
+    assert endless[-1] > 1000
