@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pbdkit.components.elasticity import bond_springs, springs_in
+from pbdkit.components.elasticity import bond_springs, mean_move, springs_in
+from pbdkit.components.rules import Springs, spring_pull
+from pbdkit.plugin import Vector
 from pbdkit.plugin.rule import Stiffness
 
 RNG = np.random.default_rng(11)
@@ -91,3 +93,17 @@ def test_springs_of_triangles_are_as_stiff_as_the_cell_permits(a: float) -> None
         other = matrix(orthotropic())
         (factor,) = springs_in(other[None], c, cells)
         assert abs(np.linalg.eigvalsh(other - factor * S)[0]) < 1e-9
+
+
+def test_particles_without_springs_and_springs_without_length_are_at_rest() -> None:
+    """Neither divides by zero: sums without a cell cause no move, and a spring the ends of which
+    coincide has no direction."""
+    none, zero = np.zeros(3), Vector(np.zeros(3), np.zeros(3))
+    springs: Any = Springs()
+    still = Vector(*np.zeros((2, 3)))
+    for move in (
+        springs.apply((zero, none), None, None),
+        mean_move((zero, none, none, none)),
+        spring_pull(Vector(*-np.ones((2, 3))), Vector(*np.ones((2, 3))), none + 2.0, none + 1.4),
+    ):
+        np.testing.assert_array_equal(np.array([*move]), np.array([*still]))

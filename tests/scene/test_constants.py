@@ -9,6 +9,7 @@ from remembering_parts import Tiring, Weakest
 
 import pbdkit
 from pbdkit.plugin import Remembered
+from pbdkit.scene.constants import _evaluate as evaluate
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.state import initial_state
 
@@ -272,3 +273,19 @@ def test_bonds_that_keep_changing_are_no_equilibrium(monkeypatch, interpreted):
     given = SHEET | {"fracture": Restless(), "solver": {"type": "equilibrium"}}
     with pytest.raises(pbdkit.DivergedError, match="bonds still change after 5 equilibria"):
         pbdkit.run(given, progress=False)
+
+
+class Scaled(Plain):
+    limit: float = 1.0
+
+
+ALIKE = [np.square, lambda x: float(x) ** 2, lambda x: 2.0]
+NOT_BY_PLACE = [np.max, np.size, lambda x: x / np.max(x), lambda x: x - np.mean(x)]
+
+
+@pytest.mark.parametrize("function", [*ALIKE, *NOT_BY_PLACE])
+def test_constants_of_varying_parameters_are_those_of_each_place_alone(function):
+    """Whether or not a function of parameters supports arrays."""
+    limits = np.array([3.0, 1.0, 2.0, 2.0, 5.0, 4.0])
+    found = evaluate(Scaled(), {"limit": limits}, lambda part: {"k": function(part.limit)})["k"]
+    np.testing.assert_array_equal(found, [function(limit) for limit in limits.tolist()])

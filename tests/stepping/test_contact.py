@@ -503,18 +503,20 @@ def test_exactly_the_particles_inside_an_obstacle_are_pushed(lattice: Any) -> No
         place = raster.place_of(raster.body_rows)
         ((_, outline),) = outlines_at(scene.barriers, 2)
         walls = Walls.of([outline])
-        for shift in (0.0, 0.9):
-            u = np.full((2, *raster.shape), shift)
+        along = np.indices(raster.shape).sum(axis=0) / sum(raster.shape)
+        for shift in (0.0 * along, 2.0 * along - 1.1):
+            u = np.stack([shift, shift])
             at = contact.positions(u, place)
             inside = outline.facing(*at)[0] < 0.0
             assert 0 < inside.sum() < len(place)
             contact.push_out(u, 2)
-            w = u.reshape(2, -1)[:, place] - shift
+            w = u.reshape(2, -1)[:, place] - shift.ravel()[place]
             np.testing.assert_array_equal((w != 0.0).any(axis=0), inside)
             one = int(np.flatnonzero(inside)[-1])
             C = contact.compliance_at(place[[one]])[:, 0]
             exact = contact_correction(*at[:, one], *C, 0, *walls)
-            np.testing.assert_array_equal(u.reshape(2, -1)[:, place[one]], np.array(exact) + shift)
+            shifted = np.array(exact) + shift.ravel()[place[one]]
+            np.testing.assert_array_equal(u.reshape(2, -1)[:, place[one]], shifted)
 
 
 @pytest.mark.parametrize("axes", [["x"], ["y"]])
