@@ -79,7 +79,7 @@ def assemble(band: Any, blocks: Any, pattern: Any, first: int, wide: int) -> Non
     """Assemble the rows of A from follower `first` on. The row of a follower that does not move
     would contain only zeros; its diagonal entry is set to 1."""
     first_entry, slot, column, weight = pattern
-    half, inner = band.shape[1] // 2, wide if wide > 1 else 1
+    half = band.shape[1] // 2
     for e in range(first, len(blocks)):
         for i in range(e * wide, (e + 1) * wide):
             for m in range(band.shape[1]):
@@ -89,7 +89,7 @@ def assemble(band: Any, blocks: Any, pattern: Any, first: int, wide: int) -> Non
             for a in range(wide):
                 for b in range(wide):
                     value = 0.0
-                    for c in range(inner):
+                    for c in range(wide):
                         value += blocks[e, slot[n], a, c] * weight[n, c, b]
                     band[e * wide + a, away + b - a] -= value
         for i in range(e * wide, (e + 1) * wide):

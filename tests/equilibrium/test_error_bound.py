@@ -535,7 +535,7 @@ def test_a_body_that_stops_is_at_its_end():
 
 def test_steps_that_do_not_decrease_are_followed_by_a_bound_all_the_same():
     """The bound is computed after four times the steps that were needed for short ones."""
-    checks, _ = first_bound(lambda n: 1.0 if n < 100 else 1e-6, 1e-6, 3)
+    checks, _ = first_bound(lambda n: 1.0 if n < 100 else 1e-6, 1e-6, 50)
     short = next(n for n in checks if n >= 100)
     assert 4 * short <= checks[-1] <= 5.1 * short
     endless, _ = first_bound(lambda n: 1e-5, 1e-6, 0, most=2000)

@@ -18,7 +18,7 @@ from pbdkit.equilibrium.system import Moves, random_displacements
 from pbdkit.progress import Watch
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.state import initial_state
-from tests.equilibrium.test_multigrid import PULL, SCENES, Skew, sheet
+from tests.equilibrium.test_multigrid import PULL, SCENES, Skew, elastic, sheet
 
 pytest.importorskip("numba")
 SMALL = {"type": "grid", "columns": 30, "rows": 14}
@@ -28,6 +28,12 @@ LINEAR = {
 }
 LINEAR["a rule of one's own"] = sheet(rule=Skew(), frame={"type": "none"}, body=SMALL)
 LINEAR["barycentre"] = SCENES["barycentre of eight, free"] | {"body": SMALL}
+
+LINEAR["a soft body with an inclusion"] = SCENES["elastic"] | {
+    "body": SMALL,
+    "rule": elastic(stiffness={"otherwise": 1e-9, "inner": 4e-9}),
+    "regions": {"inner": {"type": "disc", "centre": [14.0, 6.0], "radius": 3.4}},
+}
 
 
 def at_rest(given):

@@ -1,5 +1,6 @@
 """Neighbourhoods of every lattice and metric: shells, opposite pairs, mutuality."""
 
+import math
 from typing import Literal
 
 import numpy as np
@@ -11,6 +12,7 @@ import pbdkit
 from pbdkit.components.lattices import CentredRectangular, Hexagonal, Oblique, Rectangular, Square
 from pbdkit.components.neighbours import Chebyshev, Coordination
 from pbdkit.lattice.neighbourhood import build_neighbourhood
+from pbdkit.lattice.raster import FRAME
 from pbdkit.plugin import (
     BasisSite,
     Cell,
@@ -122,6 +124,34 @@ def test_frame_maps_are_means(lattice, neighbours):
     scene = scene_of(lattice=lattice, neighbours=neighbours)
     total = np.bincount(scene.frame.map.point, scene.frame.map.weight)
     np.testing.assert_allclose(total, 1.0, rtol=1e-15)
+
+
+@pytest.mark.parametrize("lattice", LATTICES)
+@pytest.mark.parametrize("neighbours", NEIGHBOURS)
+def test_frame_points_follow_each_of_the_nearest_particles_once(lattice, neighbours):
+    scene = scene_of(lattice=lattice, neighbours=neighbours, frame={"type": "mean"})
+    raster, follow = scene.raster, scene.frame.map
+    X = raster.reference(np.arange(raster.count))
+    body, points = raster.body_rows, np.flatnonzero(raster.table_kind == FRAME)
+    distance = np.linalg.norm(X[points][:, None] - X[body][None], axis=2)
+    near = distance <= distance.min(axis=1, keepdims=True) * (1 + 1e-9)
+    point, number = np.nonzero(near)
+    np.testing.assert_array_equal(follow.point, point)
+    np.testing.assert_array_equal(follow.body, body[number])
+    np.testing.assert_allclose(follow.weight, 1.0 / near.sum(axis=1)[point], rtol=1e-15)
+
+
+@pytest.mark.parametrize("lattice", LATTICES)
+def test_offsets_within_a_radius_include_those_of_this_length(lattice):
+    cell = scene_of(lattice=lattice).raster.cell
+    for source in range(len(cell.sites)):
+        shortest = cell.offsets(source, 2.6 * math.hypot(*cell.vectors[0]))
+        for offset in shortest:
+            within = [other for other in shortest if other.length <= offset.length]
+            assert cell.offsets(source, offset.length) == within
+            assert cell.offsets(source, 0.999 * offset.length) == [
+                other for other in within if other.length <= 0.999 * offset.length
+            ]
 
 
 class OnTheCorner(pbdkit.Lattice):

@@ -115,6 +115,7 @@ TESTS = [
     "fitting",
     "hard_cases",
     "mpi/test_partition.py",
+    "mpi/test_driver.py",
     "test_simulation.py",
     "test_random_scenes.py",
     "test_crossed_scenes.py",
@@ -283,13 +284,16 @@ def mutants_of(area: str, path: Path) -> dict[tuple[int, int], list[Mutant]]:
     names = [*OPERATORS, *(["KernelText"] if in_kernels else [])]
     operators = {name: _operator(name) for name in names}
     occurrences: Counter[str] = Counter()
-    for node in ast_nodes(parso.parse(path.read_text())):
+    source = path.read_text()
+    with_walrus = {n for n, text in enumerate(source.splitlines(), 1) if ":=" in text}
+    for node in ast_nodes(parso.parse(source)):
         relevant: bool | None = None
         for name, operator in operators.items():
             for start, _ in operator.mutation_positions(node):
                 if relevant is None:
                     relevant = _is_relevant(node, in_kernels)
-                if relevant:
+                is_python = name != "AddNot" or start[0] not in with_walrus
+                if relevant and is_python:
                     lines = _statement(node)
                     number = occurrences[name]
                     places[start].append(Mutant(area, relative, name, number, start[0], lines))

@@ -8,9 +8,8 @@ from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.neighbour_search import NeighbourSearch
 
 
-@pytest.mark.parametrize(("kind", "radius"), [("square", 1.5), ("hexagonal", 1.8)])
-def test_at_rest_the_neighbours_are_those_of_the_slots_in_their_order(kind, radius):
-    scene = build_scene(
+def near(kind, radius):
+    return build_scene(
         pbdkit.Experiment(
             name="near",
             lattice={"type": kind, "a": 1.0},
@@ -21,6 +20,11 @@ def test_at_rest_the_neighbours_are_those_of_the_slots_in_their_order(kind, radi
             steps=1,
         )
     )
+
+
+@pytest.mark.parametrize(("kind", "radius"), [("square", 1.5), ("hexagonal", 1.8)])
+def test_at_rest_the_neighbours_are_those_of_the_slots_in_their_order(kind, radius):
+    scene = near(kind, radius)
     raster = scene.raster
     search = NeighbourSearch(scene)
     j, k, rest = search.pairs(np.zeros((2, *raster.kind.shape)))
@@ -35,3 +39,19 @@ def test_at_rest_the_neighbours_are_those_of_the_slots_in_their_order(kind, radi
     ]
     assert list(zip(j.tolist(), k.tolist(), *rest.tolist(), strict=True)) == expected
     assert len(expected) > 8 * 10
+
+
+@pytest.mark.parametrize(("kind", "radius"), [("square", 1.5), ("hexagonal", 1.8)])
+def test_in_a_deformed_body_the_neighbours_are_all_particles_within_the_radius(kind, radius):
+    scene = near(kind, radius)
+    raster = scene.raster
+    u = np.random.default_rng(0).uniform(-0.6, 0.6, (2, *raster.kind.shape))
+    rows = np.arange(raster.count)
+    x = raster.reference(rows) + raster.table(u)
+    distance = np.linalg.norm(x[:, None] - x[None], axis=2)
+    is_near = (distance <= radius) & ~np.eye(len(x), dtype=bool)
+    j, k, _ = NeighbourSearch(scene).pairs(u)
+    assert {*zip(j.tolist(), k.tolist(), strict=True)} == {
+        *map(tuple, np.argwhere(is_near).tolist())
+    }
+    assert len(j) == is_near.sum()
