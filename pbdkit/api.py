@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from distributed import Client
 
     from pbdkit.fitting.fit_result import Fitted
+    from pbdkit.fitting.specimens import FittedSpecimens
     from pbdkit.fitting.strength import FittedStrength
     from pbdkit.identification.identity import Identity
     from pbdkit.model.loading import ComponentClasses, ExperimentLike
@@ -445,7 +446,7 @@ def fit(
     experiment: ExperimentLike | None = None,
     measured: xarray.Dataset | None = None,
     components: ComponentClasses = (),
-) -> Fitted | FittedStrength:
+) -> Fitted | FittedSpecimens | FittedStrength:
     """Fit parameters of an experiment to measurements, or strengths to the peaks of repeated tests.
 
     Parameters
@@ -463,8 +464,9 @@ def fit(
 
     Returns
     -------
-    Fitted or FittedStrength
-        Estimates with standard errors and correlations; a FittedStrength if the description has
+    Fitted, FittedSpecimens or FittedStrength
+        Estimates with standard errors and correlations; a FittedSpecimens, with the scatter between
+        specimens, if the description has ``specimens: true``, and a FittedStrength if it has
         ``kind: strength``. ``print`` shows a summary.
 
     Raises
@@ -473,6 +475,11 @@ def fit(
         If the description, the experiment or the measurement is invalid.
     DivergedError
         If an equilibrium or the minimum is not found.
+
+    Warns
+    -----
+    AccuracyWarning
+        If the residuals of a measurement are well above its noise.
 
     Notes
     -----
@@ -502,11 +509,13 @@ def fit(
         Fit, description, has_experiment=experiment is not None, measured=measured
     )
     try:
-        return fit_experiment(
+        fitted = fit_experiment(
             problem, _experiment_of_fit(experiment, source, components), components
         )
     except UnconvergedError as error:
         raise DivergedError(str(error)) from None
+    _warn(fitted.warnings)
+    return fitted
 
 
 def fit_strength(

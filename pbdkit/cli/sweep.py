@@ -18,6 +18,7 @@ from pbdkit.cli.output import refusals_as, refuse_output, refuse_unwritable, sav
 from pbdkit.errors import ExperimentError
 from pbdkit.fitting.fit_file import fit_schema, is_strength_fit
 from pbdkit.fitting.fit_result import Fitted
+from pbdkit.fitting.specimens import FittedSpecimens
 from pbdkit.io.atomic_file import write
 from pbdkit.io.layout import dataset_schema
 from pbdkit.model.schema import experiment_schema
@@ -136,7 +137,7 @@ def fit(file: str, output: Path | None, picture: Path | None, force: bool, quiet
         click.echo(str(result))
         click.echo(f"{path} written")
     if picture:
-        assert isinstance(result, Fitted)
+        assert isinstance(result, Fitted | FittedSpecimens)
         save(picture, draw_fit(result), replace=force, quiet=quiet)
 
 

@@ -28,9 +28,9 @@ from pbdkit.errors import AccuracyWarning, ExperimentError, did_you_mean
 from pbdkit.fitting.fit_file import Fit, Force
 from pbdkit.fitting.formula import Formula
 from pbdkit.fitting.observations import DERIVATIVES, FieldObservation, FieldPrediction
-from pbdkit.fitting.problem import Problem, Solution
+from pbdkit.fitting.problem import IDENTIFIABLE_RATIO, Problem, Solution
 from pbdkit.fitting.sensitivity import RestingScene, scene_like
-from pbdkit.fitting.uncertainty import Estimate, reaction_along
+from pbdkit.fitting.uncertainty import Estimate, errors_of, reaction_along
 from pbdkit.io.physical import Physical
 from pbdkit.io.snapshot import StateMoment, Tables
 from pbdkit.model.experiment import Experiment
@@ -123,7 +123,7 @@ def derive(fit: Fit, problem: Problem, solution: Solution) -> dict[str, Derived]
         If a formula cannot be evaluated.
     """
     formulas = [Formula(text) for text in fit.derived]
-    quantities = _quantities(formulas, fit.force, problem, solution)
+    quantities = _quantities(formulas, fit.measured_force, problem, solution)
     result: dict[str, Derived] = {}
     for n, formula in enumerate(formulas):
         try:
@@ -139,23 +139,29 @@ def derive(fit: Fit, problem: Problem, solution: Solution) -> dict[str, Derived]
         for index in np.ndindex(total.value.shape):
             name = formula.indexed(index) if total.value.size > 1 else formula.text
             result[name] = _with_error(
-                solution, float(total.value[index]), total.gradient[index],
+                problem, solution, float(total.value[index]), total.gradient[index],
                 float(total.error[index]), total.unit,
             )  # fmt: skip
     return result
 
 
 def _with_error(
-    solution: Solution, value: float, gradient: Floats, error: float, unit: str
+    problem: Problem, solution: Solution, value: float, gradient: Floats, error: float, unit: str
 ) -> Derived:
     directions = solution.directions
     if not np.isfinite([value, *gradient]).all():
         return Derived(Estimate(np.nan, np.nan, unit=unit), np.nan, np.nan)
-    of_data = directions.error_of(gradient)
+    of_data, independent = errors_of(gradient, problem, solution)
     along = directions.vectors[directions.is_null] @ (gradient * directions.scale)
     is_identifiable = bool((np.abs(along) <= UNDETERMINED * abs(value)).all())
-    total = float(np.hypot(of_data, error))
-    return Derived(Estimate(value, total, is_identifiable, unit=unit), of_data, error)
+    # The bounds of parameters that the data do not determine can be narrow enough.
+    is_bounded = bool(solution.unidentified) and of_data < IDENTIFIABLE_RATIO * abs(value)
+    total, of_independent = np.hypot(of_data, error), np.hypot(independent, error)
+    growth = float(total / of_independent) if of_independent > 0.0 else 1.0
+    estimate = Estimate(
+        value, float(total), is_identifiable or is_bounded, unit=unit, growth=growth
+    )
+    return Derived(estimate, of_data, error)
 
 
 def _of_formula(formula: Formula, quantities: Mapping[str, Quantity]) -> Quantity:
@@ -215,7 +221,7 @@ def _modulus(force: Force | None, problem: Problem, solution: Solution) -> Quant
 def refuse_other_names(fit: Fit, problem: Problem) -> None:
     """Raise ExperimentError for names in formulas that are no quantities of the fit."""
     known = {unknown.parameter.path for unknown in problem.unknowns}
-    known |= {YOUNG} if fit.force or problem.with_modulus else set()
+    known |= {YOUNG} if fit.measured_force or problem.with_modulus else set()
     observation = problem.observations[0]
     variables = {
         variable.name

@@ -11,6 +11,7 @@ import numpy as np
 import scipy.linalg  # noqa: F401  # loaded before threads are limited
 
 from pbdkit.array_types import Floats
+from pbdkit.equilibrium.error_bound import UnconvergedError
 from pbdkit.equilibrium.system import one_thread
 from pbdkit.errors import ExperimentError
 from pbdkit.fitting.crack_tip import locate_tip
@@ -19,7 +20,14 @@ from pbdkit.fitting.fit_file import Fit
 from pbdkit.fitting.fit_result import Fitted, fitted
 from pbdkit.fitting.observations import FieldObservation, Observation
 from pbdkit.fitting.parameter import Parameter
-from pbdkit.fitting.problem import Problem, Solution, Unknown, solved
+from pbdkit.fitting.problem import (
+    Problem,
+    Solution,
+    Unknown,
+    solved,
+    with_correlated_errors,
+)
+from pbdkit.fitting.specimens import FittedSpecimens, combine_specimens
 from pbdkit.fitting.uncertainty import (
     Candidate,
     SolvedProblem,
@@ -48,7 +56,9 @@ the values are rounding errors.
 """
 
 
-def fit_experiment(fit: Fit, experiment: Experiment, components: ComponentClasses = ()) -> Fitted:
+def fit_experiment(
+    fit: Fit, experiment: Experiment, components: ComponentClasses = ()
+) -> Fitted | FittedSpecimens:
     """Fit the unknown parameters of an experiment, on one thread.
 
     Parameters
@@ -62,8 +72,9 @@ def fit_experiment(fit: Fit, experiment: Experiment, components: ComponentClasse
 
     Returns
     -------
-    Fitted
-        Estimates, standard errors and residuals.
+    Fitted or FittedSpecimens
+        Estimates, standard errors and residuals; a FittedSpecimens if the fit has several
+        specimens.
 
     Raises
     ------
@@ -73,6 +84,8 @@ def fit_experiment(fit: Fit, experiment: Experiment, components: ComponentClasse
     classes = (*given_classes(experiment), *components)
     try:
         with one_thread():
+            if fit.specimens:
+                return _fit_specimens(fit, experiment, classes)
             return _fit(fit, experiment, classes)
     except ExperimentError as error:
         raise _with_place(error, experiment) from None
@@ -86,6 +99,21 @@ def _with_place(error: ExperimentError, experiment: Experiment) -> ExperimentErr
         return experiment.located(error)
     place = ".".join(map(str, error.where))
     return ExperimentError(f"{place}: {error}", error.where)
+
+
+def _fit_specimens(
+    fit: Fit, experiment: Experiment, components: ComponentClasses
+) -> FittedSpecimens:
+    """Fit each specimen, and combine the estimates."""
+    fits = {}
+    for name, part in fit.by_specimen().items():
+        try:
+            fits[name] = _fit(part, experiment, components)
+        except UnconvergedError as error:
+            raise UnconvergedError(f"specimen {name}: {error}") from None
+        except ExperimentError as error:
+            raise ExperimentError(f"specimen {name}: {error}", error.where) from None
+    return combine_specimens(fits)
 
 
 def _fit(fit: Fit, experiment: Experiment, components: ComponentClasses) -> Fitted:
@@ -187,10 +215,11 @@ def problem_of(
         )
         _refuse_too_few(observation, len(unknowns))
         observations.append(observation)
-    if fit.force and isinstance(observations[0], FieldObservation):
+    force = fit.measured_force
+    if force and isinstance(observations[0], FieldObservation):
         groups = observations[0].scene.leading
-        if fit.force.group >= len(groups):
-            text = f"there is no leader group {fit.force.group}"
+        if force.group >= len(groups):
+            text = f"there is no leader group {force.group}"
             raise ExperimentError(text, ("force", "group"))
     problem = Problem(unknowns, tuple(observations))
     _refuse_underdetermined(problem)
@@ -248,9 +277,13 @@ def _refuse_underdetermined(problem: Problem) -> None:
 
 
 def _solve(problem: Problem, fit: Fit) -> tuple[Problem, Solution]:
-    """Solve the problem. If the noise is not given, estimate it from the residuals."""
+    """Solve the problem. If the noise is not given, estimate it from the residuals.
+
+    The standard errors account for correlated residuals.
+    """
     if fit.measured[0].noise is not None:
-        return problem, solved(problem, problem.start(), fit.loss)
+        solution = solved(problem, problem.start(), fit.loss)
+        return problem, with_correlated_errors(problem, solution, fit.loss)
     (observation,) = problem.observations
     problem = replace(
         problem, observations=(observation.with_noise(TINY * _size(observation.measured)),)
@@ -265,7 +298,7 @@ def _solve(problem: Problem, fit: Fit) -> tuple[Problem, Solution]:
             problem, observations=(observation.with_noise(ratio * observation.noise),)
         )
         solution = solved(problem, solution.z, fit.loss)
-    return problem, solution
+    return problem, with_correlated_errors(problem, solution, fit.loss)
 
 
 def _size(measured: Floats) -> float:

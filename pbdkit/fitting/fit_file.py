@@ -81,20 +81,36 @@ def _once(terms: tuple[tuple[int, int], ...]) -> tuple[tuple[int, int], ...]:
 
 Terms = Annotated[tuple[Term, ...], Field(strict=False), AfterValidator(_once)]
 Pair = Annotated[tuple[float, float], Field(strict=False)]
+SpecimenName = Annotated[
+    str, BeforeValidator(lambda name: str(name), json_schema_input_type=str | int)
+]
+"""Name of a specimen; a number is read as text."""
 DIRECTIONS = {"x": (1.0, 0.0), "y": (0.0, 1.0)}
 """Unit vectors of the axes."""
+
+
+class Force(Strict):
+    """The force of a leader group and the thickness of the body, from which Young's modulus is
+    computed. Units are N, mm and MPa if the experiment has units. Otherwise the unit of the modulus
+    is that of the force divided by the unit of the thickness and by the lattice unit."""
+
+    group: Annotated[int, Field(ge=0)]
+    value: Pair
+    thickness: Positive = 1.0
+    noise: Annotated[float, Field(ge=0.0)] = 0.0
 
 
 class MeasuredColumns(Component):
     """A measurement: columns of a CSV `file` in the folder of the fit file.
 
-    `noise` is the standard deviation of the measured values; by default it is estimated from the
-    residuals. A `weight` of 4 has the same effect as half the noise. `settings` are changes of the
-    experiment, by path, for this measurement only, for instance another load or another number of
-    steps.
+    `specimen` is the name of the measured specimen, if the fit has several. `noise` is the standard
+    deviation of the measured values; by default it is estimated from the residuals. A `weight` of 4
+    has the same effect as half the noise. `settings` are changes of the experiment, by path, for
+    this measurement only, for instance another load or another number of steps.
     """
 
     file: str
+    specimen: SpecimenName | None = None
     noise: Positive | None = None
     weight: Positive = 1.0
     settings: Annotated[dict[str, Any], Field(default_factory=dict)]
@@ -183,7 +199,9 @@ def _without_type(schema: dict[str, Any]) -> None:
 class MeasuredField(MeasuredColumns):
     """Displacements of a body in equilibrium at scattered points, in lattice units.
 
-    Points that are closer to the outline of the body than `margin` are not used.
+    Points that are closer to the outline of the body than `margin` are not used. `force` is the
+    force of a leader group during this measurement. It replaces `force` of the fit, and is required
+    here if several specimens are measured under different forces.
     """
 
     model_config = ConfigDict(json_schema_extra=_without_type)
@@ -192,6 +210,7 @@ class MeasuredField(MeasuredColumns):
     columns: Annotated[tuple[str, str, str, str], Field(strict=False)] = ("x", "y", "ux", "uy")
     margin: Annotated[float, Field(ge=0.0)] = 0.0
     distortion: Distortion = Field(default_factory=Distortion)
+    force: Force | None = None
 
     def observation(self, experiment: Experiment, modes: int) -> FieldObservation:
         """Return the observation of an equilibrium. The solver of the experiment is not used."""
@@ -325,17 +344,6 @@ def _formula(text: str) -> str:
 _Formula = Annotated[str, AfterValidator(_formula)]
 
 
-class Force(Strict):
-    """The force of a leader group and the thickness of the body, from which Young's modulus is
-    computed. Units are N, mm and MPa if the experiment has units. Otherwise the unit of the modulus
-    is that of the force divided by the unit of the thickness and by the lattice unit."""
-
-    group: Annotated[int, Field(ge=0)]
-    value: Pair
-    thickness: Positive = 1.0
-    noise: Annotated[float, Field(ge=0.0)] = 0.0
-
-
 class CrackTip(Strict):
     """A crack tip with unknown position: one end of a cut in the experiment.
 
@@ -380,6 +388,11 @@ class Fit(Strict):
     displacements are prescribed. `loss` is the loss function of the residuals. All functions except
     `linear` reduce the weight of outliers.
 
+    With `specimens: true`, the measurements are of several specimens of one material, which differ.
+    Each specimen is fitted separately. The result contains the mean of each parameter over the
+    specimens with its standard error, and the standard deviation between specimens. A measurement
+    names its `specimen`; by default each measurement is of a separate one.
+
     Three computations are optional and expensive. `profile` lists the parameters of which the
     profile likelihood is computed, by fitting all other parameters again. `sampler` generates
     samples of the posterior distribution. `candidates` are other models by name, which are compared
@@ -395,6 +408,7 @@ class Fit(Strict):
     experiment: Base
     unknown: dict[str, Bounds]
     measured: Measurements
+    specimens: bool = False
     force: Force | None = None
     modes: Annotated[int, Field(ge=0, le=40)] = 6
     loss: Loss = "linear"
@@ -415,40 +429,9 @@ class Fit(Strict):
     @model_validator(mode="after")
     def _fits_together(self, info: ValidationInfo) -> Self:
         object.__setattr__(self, "_files", file_resolver(info))
-        if len(self.measured) > 1 and any(
-            measurement.noise is None for measurement in self.measured
-        ):
-            raise ValueError(
-                "several measurements require the `noise` of each, which determines their weights"
-            )
-        if self.crack_tip:
-            self._refuse_beside_tip()
-        if self.force and not isinstance(self.measured[0], MeasuredField):
-            raise ValueError(
-                "`force` is the force of a group in equilibrium while a field is measured; give "
-                "forces over displacement as a curve"
-            )
-        if self.force and self.force.value == (0.0, 0.0):
-            raise ValueError(
-                "`force` is 0 along both axes, which does not determine a modulus; omit it"
-            )
-        curves_without_modulus = [
-            measurement
-            for measurement in self.measured
-            if isinstance(measurement, MeasuredCurve) and not measurement.youngs_modulus
-        ]
-        if not (
-            self.unknown or self.force or curves_without_modulus or self.derived or self.crack_tip
-        ):
-            raise ValueError(
-                "there is nothing to fit: without `unknown` parameters, give a `force` or a curve "
-                "for Young's modulus, `derived` quantities, or a `crack_tip`"
-            )
-        if self.force and curves_without_modulus:
-            raise ValueError(
-                "both `force` and a curve without `youngs_modulus` determine Young's modulus; "
-                "omit `force`"
-            )
+        self._refuse_unclear_specimens()
+        for fit in self.by_specimen().values():
+            fit._refuse_unclear_measurements()
         if invalid := [path for path in self.profile if path not in self.unknown]:
             hint = did_you_mean(invalid[0], self.unknown)
             raise ValueError(f"`profile` names '{invalid[0]}', which is not unknown{hint}")
@@ -457,6 +440,82 @@ class Fit(Strict):
         if self.sampler and self.sampler.walkers < 2 * len(self.unknown):
             raise ValueError("a `sampler` requires at least two walkers for each parameter")
         return self
+
+    def by_specimen(self) -> dict[str, Fit]:
+        """Return the fit of each specimen by name; without `specimens`, this fit with an empty
+        name."""
+        if not self.specimens:
+            return {"": self}
+        groups: dict[str, list[MeasuredColumns]] = {}
+        for n, measurement in enumerate(self.measured, 1):
+            groups.setdefault(measurement.specimen or str(n), []).append(measurement)
+        return {
+            name: self.model_copy(update={"measured": tuple(group), "specimens": False})
+            for name, group in groups.items()
+        }
+
+    @property
+    def measured_force(self) -> Force | None:
+        """Return the force during the first measurement."""
+        return getattr(self.measured[0], "force", None) or self.force
+
+    def _refuse_unclear_specimens(self) -> None:
+        names = [measurement.specimen for measurement in self.measured]
+        if not self.specimens:
+            if any(names):
+                raise ValueError(
+                    "a measurement names its `specimen`; set `specimens: true` to fit several"
+                )
+            return
+        if any(names) and not all(names):
+            raise ValueError(
+                f"measurement {names.index(None)} names no `specimen`; name it in all or in none"
+            )
+        if len(self.by_specimen()) < 2:
+            raise ValueError("`specimens: true` requires measurements of at least two specimens")
+        if self.profile or self.sampler or self.candidates:
+            raise ValueError(
+                "`profile`, `sampler` and `candidates` describe one specimen; omit them, or fit "
+                "each specimen in a file of its own"
+            )
+
+    def _refuse_unclear_measurements(self) -> None:
+        """Raise ValueError if the measurements of one specimen do not fit together."""
+        if self.crack_tip:
+            self._refuse_beside_tip()
+        force = self.measured_force
+        if any(getattr(measurement, "force", None) for measurement in self.measured[1:]):
+            raise ValueError("give `force` at the first measurement of a specimen, or for the fit")
+        if len(self.measured) > 1 and any(
+            measurement.noise is None for measurement in self.measured
+        ):
+            raise ValueError(
+                "several measurements require the `noise` of each, which determines their weights"
+            )
+        if force and not isinstance(self.measured[0], MeasuredField):
+            raise ValueError(
+                "`force` is the force of a group in equilibrium while a field is measured; give "
+                "forces over displacement as a curve"
+            )
+        if force and force.value == (0.0, 0.0):
+            raise ValueError(
+                "`force` is 0 along both axes, which does not determine a modulus; omit it"
+            )
+        curves_without_modulus = [
+            measurement
+            for measurement in self.measured
+            if isinstance(measurement, MeasuredCurve) and not measurement.youngs_modulus
+        ]
+        if not (self.unknown or force or curves_without_modulus or self.derived or self.crack_tip):
+            raise ValueError(
+                "there is nothing to fit: without `unknown` parameters, give a `force` or a curve "
+                "for Young's modulus, `derived` quantities, or a `crack_tip`"
+            )
+        if force and curves_without_modulus:
+            raise ValueError(
+                "both `force` and a curve without `youngs_modulus` determine Young's modulus; "
+                "omit `force`"
+            )
 
     def _refuse_beside_tip(self) -> None:
         if len(self.measured) > 1 or not isinstance(self.measured[0], MeasuredField):

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pbdkit.array_types import Floats
+from pbdkit.errors import AccuracyWarning, WarningText
+from pbdkit.fitting.correlation import Correlation
 from pbdkit.fitting.crack_tip import LocatedTip
 from pbdkit.fitting.derived import Derived
 from pbdkit.fitting.fit_file import Fit
@@ -37,6 +39,11 @@ from pbdkit.simulation import Simulation, record
 
 if TYPE_CHECKING:
     import xarray
+
+EXCESS_RATIO = 1.5
+"""Ratio of residuals to noise above which a warning is issued."""
+EXCESS_DEVIATIONS = 4.0
+"""Standard deviations by which the ratio of few independent residuals must exceed 1."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +91,40 @@ class FittedNumbers:
 
 
 @dataclass(frozen=True)
+class ResidualCorrelation:
+    """Correlation of the residuals of one measurement at a distance d > 0.
+
+    It is share · exp(-(d / length)^power).
+
+    Parameters
+    ----------
+    length : float
+        Correlation length.
+    share : float
+        Correlated fraction of the variance; the remainder is independent.
+    power : float
+        Exponent, 1 or 2.
+    effective : float
+        Number of independent values with the same variance of the mean.
+    unit : str
+        Unit of the length; empty if the experiment has no units.
+    """
+
+    length: float
+    share: float
+    power: float
+    effective: float
+    unit: str = ""
+
+    def __str__(self) -> str:
+        length = f"{self.length:.3g} {self.unit}".rstrip()
+        return (
+            f"residuals are correlated over {length} ({100.0 * self.share:.0f} % of their "
+            f"variance): as much information as {self.effective:.0f} independent numbers"
+        )
+
+
+@dataclass(frozen=True)
 class Misfit:
     """Residuals of one measurement.
 
@@ -101,6 +142,8 @@ class Misfit:
         Number of rows of the file that are not used, and the reason.
     factor, unit
         If the experiment has units, `factor` times the noise is its value in `unit`.
+    correlation
+        Correlation of the residuals; None if it is not significant.
     """
 
     kind: str
@@ -111,16 +154,27 @@ class Misfit:
     left_out_because: str = ""
     factor: float = 1.0
     unit: str = ""
+    correlation: ResidualCorrelation | None = None
+
+    @property
+    def noise_with_unit(self) -> str:
+        """Noise with its unit, as text."""
+        return f"{self.factor * self.noise:.3g} {self.unit}".rstrip()
 
     def __str__(self) -> str:
-        noise = f"{self.factor * self.noise:.3g} {self.unit}".rstrip()
         text = (
-            f"residual of the {self.kind}: {self.ratio:.2f} times the noise of {noise}, over "
-            f"{self.numbers} numbers"
+            f"residual of the {self.kind}: {self.ratio:.2f} times the noise of "
+            f"{self.noise_with_unit}, over {self.numbers} numbers"
         )
         if not self.left_out:
             return text
         return f"{text}; {self.left_out} rows are omitted: {self.left_out_because}"
+
+    @property
+    def exceeds_noise(self) -> bool:
+        """True if the residuals are well above the noise."""
+        limit = 1.0 + EXCESS_DEVIATIONS / np.sqrt(2.0 * max(self.numbers, 1))
+        return bool(self.ratio > max(EXCESS_RATIO, limit))
 
 
 @dataclass(frozen=True)
@@ -128,7 +182,8 @@ class Fitted:
     """Result of a fit.
 
     If the residuals are larger than the noise divided by the square root of the weight, the
-    standard errors are multiplied by the ratio of both.
+    standard errors are multiplied by the ratio of both. If the residuals of a field or a curve are
+    significantly correlated, standard errors account for the correlation.
 
     Parameters
     ----------
@@ -223,6 +278,16 @@ class Fitted:
         }
         return memory.dataset().assign_coords(derived=[*self.derived]).assign(columns)
 
+    @property
+    def warnings(self) -> tuple[WarningText, ...]:
+        """Warnings of measurements with residuals well above the noise."""
+        several = len(self.misfits) > 1
+        return tuple(
+            WarningText(_excess_text(misfit, n, several), AccuracyWarning)
+            for n, misfit in enumerate(self.misfits)
+            if misfit.exceeds_noise
+        )
+
     def as_dict(self) -> dict[str, Any]:
         """Return the result as plain values, for JSON.
 
@@ -245,6 +310,7 @@ class Fitted:
             "youngs_modulus": None if modulus is None else modulus.as_dict(),
             "residual_over_noise": self.ratio,
             "measured": [asdict(misfit) for misfit in self.misfits],
+            "warnings": [*map(str, self.warnings)],
             "evaluations": self.solution.evaluations,
         } | self._on_request()
 
@@ -404,7 +470,12 @@ class Fitted:
             for m, second in list(enumerate(self.values))[n + 1 :]:
                 if abs(self.correlations[n, m]) > 0.5:
                     yield f"correlation of {first} and {second}: {self.correlations[n, m]:.2f}"
-        yield from map(str, self.misfits)
+        for misfit in self.misfits:
+            yield str(misfit)
+            if misfit.correlation:
+                yield f"  {misfit.correlation}"
+        if any(misfit.correlation for misfit in self.misfits):
+            yield f"the correlation increases standard errors: {', '.join(self._growths())}"
         for path, profile in self.profiles.items():
             yield f"{path}: {profile}, by its profile"
         if self.sample:
@@ -412,6 +483,12 @@ class Fitted:
             for path, mean, deviation, error in numbers:
                 yield f"{path}: {Estimate(mean, deviation)}, by the sampler, to ± {error:.1g}"
         yield from map(str, self.candidates)
+
+    def _growths(self) -> Iterator[str]:
+        modulus = {MODULUS: self.youngs_modulus} if self.youngs_modulus else {}
+        for name, estimate in (dict(self.values) | modulus).items():
+            if estimate.identifiable:
+                yield f"{name} by a factor of {estimate.growth:.2f}"
 
 
 def fitted(fit: Fit, problem: Problem, solution: Solution) -> Fitted:
@@ -424,24 +501,68 @@ def fitted(fit: Fit, problem: Problem, solution: Solution) -> Fitted:
             float(error),
             unknown.parameter.path not in solution.unidentified,
             unknown.parameter.path in solution.on_bounds,
+            growth=float(growth),
         )
-        for unknown, value, error in zip(problem.unknowns, solution.z, errors, strict=False)
+        for unknown, value, error, growth in zip(
+            problem.unknowns, solution.z, errors, solution.growth, strict=False
+        )
     }
     covariance = solution.covariance[:count, :count]
     correlations = covariance / np.outer(errors, errors)
     residuals = solution.at.residuals.copy()
     for observation, rows in problem.rows():
         residuals[rows] /= np.sqrt(observation.weight)
-    misfits = tuple(_residuals_of(each, residuals[rows], fit.loss) for each, rows in problem.rows())
+    of_residuals = solution.correlations or (None,) * len(problem.observations)
+    misfits = tuple(
+        _residuals_of(observation, residuals[rows], fit.loss, correlation)
+        for (observation, rows), correlation in zip(problem.rows(), of_residuals, strict=True)
+    )
     ratio = spread_of(residuals, problem.size, fit.loss)
-    modulus = youngs_modulus(fit.force, problem, solution)
+    modulus = youngs_modulus(fit.measured_force, problem, solution)
     several = combinations(problem, solution)
     return Fitted(
         values, correlations, modulus, misfits, ratio, problem, solution, combinations=several
     )
 
 
-def _residuals_of(observation: Observation, residuals: Floats, loss: Loss) -> Misfit:
+def _excess_text(misfit: Misfit, n: int, several: bool) -> str:
+    """Return the warning for residuals that are well above the noise."""
+    place = f"measured.{n}" if several else "measured"
+    return (
+        f"{place}: the residuals of the {misfit.kind} are {misfit.ratio:.1f} times the noise of "
+        f"{misfit.noise_with_unit}: the noise is larger than stated, or the experiment does not "
+        "describe the measurement. Standard errors are multiplied by the ratio of all residuals, "
+        "but do not contain the bias of a wrong experiment. Correct `noise`, add terms of "
+        "`distortion` or `modes`, use a smaller lattice constant, or compare `candidates`"
+        + "; if the measurements are of several specimens, set `specimens: true`"
+        * several
+    )
+
+
+def _correlation_of(
+    observation: Observation, correlation: Correlation | None
+) -> ResidualCorrelation | None:
+    """Return the correlation of the residuals of an observation in the units of the experiment."""
+    places = observation.correlated_places()
+    if correlation is None or places is None:
+        return None
+    components = len(observation.measured) // len(places)
+    units = observation.experiment.units
+    factor, unit = (units.length_mm, LENGTH.unit) if units else (1.0, "")
+    if isinstance(observation, CurveObservation) and observation.at_times:
+        factor, unit = 1.0, "steps"
+    return ResidualCorrelation(
+        factor * correlation.length,
+        correlation.share,
+        correlation.power,
+        components * correlation.effective_count(places),
+        unit,
+    )
+
+
+def _residuals_of(
+    observation: Observation, residuals: Floats, loss: Loss, correlation: Correlation | None
+) -> Misfit:
     """Summarise the residuals of an observation."""
     return Misfit(
         observation.kind,
@@ -451,6 +572,7 @@ def _residuals_of(observation: Observation, residuals: Floats, loss: Loss) -> Mi
         observation.left_out,
         observation.left_out_because,
         *unit_of(observation),
+        _correlation_of(observation, correlation),
     )
 
 

@@ -623,6 +623,13 @@ class Observation(ABC):
         Rows with similar coordinates contain similar information.
         """
 
+    def correlated_places(self) -> Floats | None:
+        """Return coordinates of the rows; the correlation of residuals depends on their distance.
+
+        The result is None if the correlation does not depend on a distance alone.
+        """
+        return self.places()
+
     def part(self, mask: NDArray[np.bool_]) -> Self:
         """Select some of the rows by a mask."""
         columns = len(self.measured) // len(self.rows)
@@ -1165,6 +1172,10 @@ class TracksObservation(RunObservation):
     def places(self) -> Floats:
         """Return the tracked points."""
         return self.points
+
+    def correlated_places(self) -> None:
+        """Return None, because the correlation depends on places and times."""
+        return
 
     def part(self, mask: NDArray[np.bool_]) -> TracksObservation:
         """Select some of the rows by a mask."""

@@ -24,6 +24,7 @@ from pbdkit.array_types import Floats
 from pbdkit.equilibrium.error_bound import UnconvergedError
 from pbdkit.equilibrium.system import Moves
 from pbdkit.errors import ExperimentError
+from pbdkit.fitting.correlation import Correlation, estimate_correlation, is_correlated
 from pbdkit.fitting.observations import FieldObservation, NearbyPrediction, Observation, Prediction
 from pbdkit.fitting.parameter import Parameter
 from pbdkit.fitting.sensitivity import scene_like
@@ -345,13 +346,13 @@ class Problem:
 
 Loss = Literal["linear", "soft_l1", "huber", "cauchy"]
 IDENTIFIABLE_RATIO = 0.25
-"""Largest standard error along an identifiable direction, relative to the bounds.
+"""Largest standard error of an identifiable parameter, relative to the interval between its bounds.
 
-It is divided by the interval between the bounds.
+A parameter that is uniformly distributed between its bounds has a standard deviation of 0.29 of
+this interval.
 """
-MIN_COMPONENT = 0.3
-"""A parameter is considered a part of a direction if its component in the direction exceeds this
-number."""
+UNIFORM_PRECISION = 12.0
+"""Inverse of the variance of a uniform distribution on an interval of length 1."""
 AT_BOUND = 1e-6
 """Distance from a bound up to which a value is at the bound, relative to the interval."""
 MAX_ITERATIONS = 50
@@ -384,6 +385,8 @@ RANK = 1e-5
 
 It is equal to the accuracy of derivatives.
 """
+PRIOR_RANK = 1e-12
+"""Relative tolerance of singular values of the square root of the information."""
 INVOLVED = 1e-2
 """Component of a null direction below which an unknown is not a part of the direction.
 
@@ -402,6 +405,8 @@ It is in units of the noise.
 """
 MIN_SLOPE = 0.05
 """Smallest admissible mean slope ψ' of a loss. Below it nearly all residuals are outliers."""
+MIN_RATIO = 0.5
+"""Ratio of residuals to noise below which the remaining variance of the noise is independent."""
 OUTLIERS = 1.345
 """Residual, in units of the noise, above which a loss reduces its weight (Huber)."""
 
@@ -439,17 +444,15 @@ class Directions:
         """Return a mask of unknowns that the data do not determine sufficiently, (direction,
         unknown).
 
-        An unknown is marked for each direction to which it belongs and along which its value is
-        uncertain.
+        An unknown is marked for each direction along which the standard error of the unknown itself
+        is too large.
         """
-        components = np.abs(self.vectors)
-        is_large = components * np.sqrt(self.variance)[:, None] > IDENTIFIABLE_RATIO
-        is_uncertain = (self.variance > IDENTIFIABLE_RATIO**2)[:, None]
-        return np.where(
-            self.is_null[:, None],
-            components > 0.0,
-            is_uncertain & (is_large | (components > MIN_COMPONENT)),
-        )
+        return np.abs(self.vectors) * np.sqrt(self.variance)[:, None] > IDENTIFIABLE_RATIO
+
+    @property
+    def spread(self) -> Floats:
+        """Return the standard errors of z, in units of `scale`."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)) / self.scale)
 
     def errors(self, step: Floats) -> Floats:
         """Return the component of a step along each direction, in standard errors; 0 along null
@@ -457,13 +460,26 @@ class Directions:
         along = (self.vectors @ (step / self.scale)) / np.sqrt(self.variance)
         return np.where(self.is_null, 0.0, along)
 
-    def error_of(self, gradient: Floats) -> float:
+    def error_of(self, gradient: Floats, unidentified: Sequence[int] = ()) -> float:
         """Return the standard error of a function of z, computed from its gradient.
 
         Null directions are excluded.
+
+        Parameters
+        ----------
+        gradient : (unknown,)
+            Derivatives of the function.
+        unidentified
+            Indices of parameters that the data do not determine. They are assumed to be uniformly
+            distributed between their bounds, which adds to the information of the data.
         """
-        along = self.vectors @ (gradient * self.scale)
-        return float(np.sqrt(np.square(along[~self.is_null]) @ self.variance[~self.is_null]))
+        gradient = gradient * self.scale
+        vectors, variance = self.vectors[~self.is_null], self.variance[~self.is_null]
+        if not len(unidentified):
+            return float(np.sqrt(np.square(vectors @ gradient) @ variance))
+        bounded = np.sqrt(UNIFORM_PRECISION) * np.eye(len(gradient))[[*unidentified]]
+        factor = np.vstack([vectors / np.sqrt(variance)[:, None], bounded])
+        return float(np.linalg.norm(gradient @ np.linalg.pinv(factor, rcond=PRIOR_RANK)))
 
 
 @dataclass(frozen=True)
@@ -482,9 +498,14 @@ class Solution:
         Standard deviation of the residuals divided by their noise.
     unidentified, on_bounds
         Paths of the parameters that are not identifiable, and of the parameters that are at their
-        bounds.
+        bounds. Both are independent of each other.
     evaluations
         Number of linearisations.
+    correlations
+        Correlation of the residuals of each observation; None if it is not significant. Empty if
+        the residuals were not tested.
+    independent
+        Directions with the variance for independent residuals, if a correlation is significant.
     """
 
     z: Floats
@@ -494,11 +515,20 @@ class Solution:
     unidentified: tuple[str, ...]
     on_bounds: tuple[str, ...]
     evaluations: int
+    correlations: tuple[Correlation | None, ...] = ()
+    independent: Directions | None = None
 
     @cached_property
     def covariance(self) -> Floats:
         """Return the covariance of z."""
         return self.directions.covariance
+
+    @cached_property
+    def growth(self) -> Floats:
+        """Return the factor by which correlations increase the standard errors of z, (unknown,)."""
+        if self.independent is None:
+            return np.ones(len(self.z))
+        return np.asarray(np.sqrt(np.diag(self.covariance) / np.diag(self.independent.covariance)))
 
     @property
     def errors(self) -> Floats:
@@ -718,21 +748,33 @@ def cost_of(residuals: Floats, loss: Loss) -> float:
     return float(z.sum()) * OUTLIERS**2
 
 
-def spread_of(residuals: Floats, unknowns: int, loss: Loss) -> float:
+def spread_of(residuals: Floats, unknowns: float, loss: Loss) -> float:
     """Return the standard deviation of residuals divided by their noise. With a loss, it is
-    estimated from the median of their magnitudes."""
+    estimated from the median of their magnitudes.
+
+    `unknowns` is the number of degrees of freedom that the fit has removed.
+    """
     if loss == "linear":
         return float(np.sqrt(residuals @ residuals / max(1, len(residuals) - unknowns)))
     return float(1.4826 * np.median(np.abs(residuals)))
 
 
 def _identify_directions(
-    problem: Problem, at: Linearisation, loss: Loss
+    problem: Problem,
+    at: Linearisation,
+    loss: Loss,
+    correlations: Sequence[Correlation | None] = (),
 ) -> tuple[Directions, tuple[str, ...]]:
     """Return directions with their variance, and the parameters that are not identifiable.
 
     Residuals are assumed to be at least as large as their noise. Parameters are scaled by the
     interval between their bounds, Young's modulus by its value.
+
+    Parameters
+    ----------
+    correlations
+        Correlation of the residuals of each observation; None, or nothing, for independent
+        residuals.
     """
     count, size = len(problem.unknowns), np.linalg.norm(at.jacobian, axis=0)
     size = np.where(size > 0.0, size, 1.0)
@@ -740,25 +782,91 @@ def _identify_directions(
     scale[:count] = [unknown.span for unknown in problem.unknowns]
     if problem.with_modulus:
         scale[count] = abs(at.z[count]) or 1.0
-    _, sizes, vectors = _singular(at.jacobian / size)
+    basis, sizes, vectors = _singular(at.jacobian / size)
     rank = len(sizes)
-    _, sizes, vectors = np.linalg.svd(sizes[:, None] * vectors * (size * scale))
+    rotation, sizes, vectors = np.linalg.svd(sizes[:, None] * vectors * (size * scale))
     variance = np.full(len(vectors), NULL_VARIANCE)
-    variance[:rank] = np.minimum(
-        _variance_of_loss(at.residuals, problem.size, loss) / sizes**2, NULL_VARIANCE
-    )
+    if any(correlations):
+        product = _correlated_product(problem, basis @ rotation, correlations)
+        factor = _variance_of_loss(at.residuals, float(np.trace(product)), loss)
+        axes, deviations = _principal_axes(product, sizes)
+        variance[:rank] = np.minimum(factor * deviations**2, NULL_VARIANCE)
+        vectors[:rank] = axes.T @ vectors[:rank]
+    else:
+        factor = _variance_of_loss(at.residuals, problem.size, loss)
+        variance[:rank] = np.minimum(factor / sizes**2, NULL_VARIANCE)
     shares = np.abs(vectors[rank:] * (size * scale))
     vectors[rank:][shares < INVOLVED * shares.max(axis=1, initial=0.0)[:, None]] = 0.0
     directions = Directions(vectors, variance, scale)
-    spread = np.sqrt(np.diag(directions.covariance)) / scale
-    is_unidentified = (directions.unsure.any(axis=0) | (spread > IDENTIFIABLE_RATIO))[:count]
+    is_unidentified = directions.spread[:count] > IDENTIFIABLE_RATIO
     names = [unknown.parameter.path for unknown in problem.unknowns]
     return directions, tuple(
         name for name, flag in zip(names, is_unidentified, strict=True) if flag
     )
 
 
-def _variance_of_loss(residuals: Floats, unknowns: int, loss: Loss) -> float:
+def _correlated_product(
+    problem: Problem, basis: Floats, correlations: Sequence[Correlation | None]
+) -> Floats:
+    """Return QᵀRQ for the correlation matrix R of the residuals and an orthonormal basis Q.
+
+    Its trace is the number of degrees of freedom of the noise that the unknowns have removed from
+    the residuals.
+    """
+    result = np.zeros((basis.shape[1], basis.shape[1]))
+    for (observation, rows), correlation in zip(problem.rows(), correlations, strict=True):
+        part, places = basis[rows], observation.correlated_places()
+        if correlation is None or places is None:
+            result += part.T @ part
+        else:
+            result += correlation.product(part.reshape(-1, len(places), part.shape[1]), places)
+    return result
+
+
+def _principal_axes(product: Floats, sizes: Floats) -> tuple[Floats, Floats]:
+    """Return the principal axes of the covariance S⁻¹ product S⁻¹, and the standard deviation along
+    each. S is the diagonal matrix of singular values."""
+    values, vectors = np.linalg.eigh(product)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    axes, deviations, _ = np.linalg.svd(root / sizes[:, None])
+    return axes, deviations
+
+
+def with_correlated_errors(problem: Problem, solution: Solution, loss: Loss) -> Solution:
+    """Return the solution with standard errors that account for correlations of the residuals.
+
+    They do not change if no correlation is significant.
+    """
+    at = solution.at
+    size = np.linalg.norm(at.jacobian, axis=0)
+    basis, *_ = _singular(at.jacobian / np.where(size > 0.0, size, 1.0))
+    scores, _ = _influence(at.residuals, problem.size, loss)
+    correlations = []
+    for observation, rows in problem.rows():
+        places, correlation = observation.correlated_places(), None
+        if places is not None:
+            residuals = scores[rows].reshape(-1, len(places))
+            part = basis[rows].reshape(*residuals.shape, -1)
+            if is_correlated(residuals, part, places):
+                correlation = estimate_correlation(residuals, part, places)
+                # Far below the noise, residuals are not a sample of it.
+                ratio = spread_of(at.residuals[rows], 0, loss) / np.sqrt(observation.weight)
+                share = correlation.share * min(1.0, ratio / MIN_RATIO) ** 2
+                correlation = replace(correlation, share=share)
+        correlations.append(correlation)
+    if not any(correlations):
+        return replace(solution, correlations=tuple(correlations))
+    directions, unidentified = _identify_directions(problem, at, loss, correlations)
+    return replace(
+        solution,
+        directions=directions,
+        unidentified=unidentified,
+        correlations=tuple(correlations),
+        independent=solution.directions,
+    )
+
+
+def _variance_of_loss(residuals: Floats, unknowns: float, loss: Loss) -> float:
     """Return the factor by which a loss changes the variance, mean ψ² / (mean ψ')².
 
     The scores ψ are in units of the noise.
@@ -767,29 +875,35 @@ def _variance_of_loss(residuals: Floats, unknowns: int, loss: Loss) -> float:
     return square / slope**2
 
 
-def rise_of_loss(residuals: Floats, unknowns: int, loss: Loss) -> float:
+def rise_of_loss(residuals: Floats, unknowns: float, loss: Loss) -> float:
     """Return the ratio of the increase of -2 log L to that of χ²: mean ψ² / mean ψ'."""
     square, slope = _scores(residuals, unknowns, loss)
     return square / slope
 
 
-def _scores(residuals: Floats, unknowns: int, loss: Loss) -> tuple[float, float]:
+def _scores(residuals: Floats, unknowns: float, loss: Loss) -> tuple[float, float]:
     """Return mean ψ², in units of the noise, and mean ψ' of the residuals.
 
     The residuals are assumed to be at least as large as the noise. For a linear loss, mean ψ² is
     the square of Birge's ratio.
     """
-    spread = spread_of(residuals, unknowns, loss)
     if loss == "linear":
-        return max(1.0, spread) ** 2, 1.0
+        return max(1.0, spread_of(residuals, unknowns, loss)) ** 2, 1.0
+    psi, slope = _influence(residuals, unknowns, loss)
+    return float(np.mean(psi**2) * OUTLIERS**2), max(float(np.mean(slope)), MIN_SLOPE)
+
+
+def _influence(residuals: Floats, unknowns: float, loss: Loss) -> tuple[Floats, Floats]:
+    """Return ψ and ψ' of each residual, (residual,). For a linear loss, ψ is the residual."""
+    if loss == "linear":
+        return residuals, np.ones(len(residuals))
+    spread = spread_of(residuals, unknowns, loss)
     z = residuals / min(1.0, max(spread, 1e-300)) / OUTLIERS
     if loss == "huber":
-        psi, slope = np.clip(z, -1.0, 1.0), np.abs(z) <= 1.0
-    elif loss == "soft_l1":
-        psi, slope = z / np.sqrt(1.0 + z * z), (1.0 + z * z) ** -1.5
-    else:
-        psi, slope = z / (1.0 + z * z), (1.0 - z * z) / (1.0 + z * z) ** 2
-    return float(np.mean(psi**2) * OUTLIERS**2), max(float(np.mean(slope)), MIN_SLOPE)
+        return np.clip(z, -1.0, 1.0), np.asarray(np.abs(z) <= 1.0, float)
+    if loss == "soft_l1":
+        return z / np.sqrt(1.0 + z * z), (1.0 + z * z) ** -1.5
+    return z / (1.0 + z * z), (1.0 - z * z) / (1.0 + z * z) ** 2
 
 
 def _on_bounds(problem: Problem, z: Floats) -> tuple[str, ...]:

@@ -3,7 +3,9 @@
 Profile likelihood: for each value of one parameter, all other parameters are fitted again. The 95 %
 interval contains the values at which -2 log L exceeds its minimum by less than 3.84 (Wilks). This
 is also valid for strongly nonlinear predictions. With a loss, the increase is divided by mean ψ² /
-mean ψ', as for M-estimators.
+mean ψ', as for M-estimators. If residuals are correlated, it is divided by the factor by which the
+variance of the parameter grows; for samples, by the mean of this factor (Pauli, Racugno and Ventura
+2011, Statistica Sinica 21, 149).
 
 Posterior: unknowns on which predictions depend linearly are integrated out exactly. These are the
 boundaries of a linear rule, distortions and Young's modulus. The boundaries of nonlinear rules are
@@ -65,6 +67,8 @@ class Estimate:
         Whether the value is at a bound, so that the fit might be better without the bound.
     unit : str
         Unit of value and error; empty if the experiment has no units.
+    growth : float
+        Factor by which the correlation of residuals increases the error.
     """
 
     value: float
@@ -72,13 +76,19 @@ class Estimate:
     identifiable: bool = True
     on_bound: bool = False
     unit: str = ""
+    growth: float = 1.0
 
     def __str__(self) -> str:
         if not self.identifiable:
             return "not identifiable from the data"
-        digits = max(0, 1 - int(np.floor(np.log10(self.error)))) if self.error > 0.0 else 6
-        text = f"{self.value:.{min(digits, 12)}f} ± {self.error:.{min(digits, 12)}f}"
+        text = f"{self.value:.{self.decimals}f} ± {self.error:.{self.decimals}f}"
         return text + f" {self.unit}" * bool(self.unit) + ", at its bound" * self.on_bound
+
+    @property
+    def decimals(self) -> int:
+        """Number of decimals with which two digits of the error are printed."""
+        digits = 1 - int(np.floor(np.log10(self.error))) if self.error > 0.0 else 6
+        return min(max(0, digits), 12)
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values; None if the value is not identifiable."""
@@ -98,31 +108,43 @@ def youngs_modulus(force: Force | None, problem: Problem, solution: Solution) ->
     count, units = len(problem.unknowns), problem.observations[0].experiment.units
     unit = STRESS.unit if units else ""
     if problem.with_modulus:
-        value, error = float(solution.z[count]), float(solution.errors[count])
-        return Estimate(
-            value, error, identifiable=error < IDENTIFIABLE_RATIO * abs(value), unit=unit
-        )
+        value, gradient = float(solution.z[count]), np.eye(problem.size)[count]
+        return _modulus(value, *errors_of(gradient, problem, solution), unit)
     if force is None:
         return None
-    estimate, size = (
-        _modulus_from_force(force, problem, solution),
-        units.length_mm if units else 1.0,
-    )
-    return replace(estimate, value=estimate.value / size, error=estimate.error / size, unit=unit)
+    value, error, independent = _modulus_from_force(force, problem, solution)
+    size = units.length_mm if units else 1.0
+    return _modulus(value / size, error / size, independent / size, unit)
 
 
-def _modulus_from_force(force: Force, problem: Problem, solution: Solution) -> Estimate:
+def _modulus(value: float, error: float, independent: float, unit: str) -> Estimate:
+    """Return the estimate of a modulus. It has no bounds, so that its error is compared with its
+    value."""
+    identifiable = error < IDENTIFIABLE_RATIO * abs(value)
+    growth = error / independent if independent > 0.0 else 1.0
+    return Estimate(value, error, identifiable=identifiable, unit=unit, growth=growth)
+
+
+def errors_of(gradient: Floats, problem: Problem, solution: Solution) -> tuple[float, float]:
+    """Return the standard error of a function of z, and that for independent residuals."""
+    paths = [unknown.parameter.path for unknown in problem.unknowns]
+    unidentified = [paths.index(path) for path in solution.unidentified]
+    error = solution.directions.error_of(gradient, unidentified)
+    if solution.independent is None:
+        return error, error
+    return error, solution.independent.error_of(gradient, unidentified)
+
+
+def _modulus_from_force(
+    force: Force, problem: Problem, solution: Solution
+) -> tuple[float, float, float]:
     """Return the ratio of the measured force per thickness to the group's force divided by
-    Young's modulus, both along the measured force."""
+    Young's modulus, both along the measured force.
+
+    Also return its standard error, and that for independent residuals.
+    """
     unit, gradient = reaction_along(force, problem, solution)
-    unidentified = [
-        n
-        for n, unknown_ in enumerate(problem.unknowns)
-        if unknown_.parameter.path in solution.unidentified
-    ]
-    is_affected = (np.abs(gradient[unidentified]) > 1e-9 * abs(unit)).any()
-    gradient[unidentified] = 0.0
-    error_of_unit = solution.directions.error_of(gradient)
+    errors = np.array(errors_of(gradient, problem, solution))
     if unit <= 0.0:
         raise ExperimentError(
             f"the force of group {force.group} has the opposite direction in this experiment; "
@@ -131,8 +153,8 @@ def _modulus_from_force(force: Force, problem: Problem, solution: Solution) -> E
         )
     size = float(np.hypot(*force.value))
     value = size / force.thickness / unit
-    error = abs(value) * np.hypot(error_of_unit / unit, force.noise / size)
-    return Estimate(value, float(error), identifiable=not is_affected)
+    error, independent = abs(value) * np.hypot(errors / unit, force.noise / size)
+    return value, float(error), float(independent)
 
 
 def reaction_along(force: Force, problem: Problem, solution: Solution) -> tuple[float, Floats]:
@@ -388,7 +410,7 @@ def _walk(
     low, high = _ends(problem.unknowns[n])
     value, z = float(solution.z[n]), solution.z
     step = min(STEP * float(solution.errors[n]), MAX_FIRST_STEP * (high - low))
-    unit, minimum = _unit(problem, solution, loss)
+    unit, minimum = _unit(problem, solution, n, loss)
     for count in range(MAX_STEPS):
         value = min(max(value + direction * step, low), high)
         try:
@@ -406,7 +428,7 @@ def _refine(side: Floats, problem: Problem, solution: Solution, n: int, loss: Lo
 
     The square root of the rise is not linear near this value if the profile is flat near the fit.
     """
-    unit, minimum = _unit(problem, solution, loss)
+    unit, minimum = _unit(problem, solution, n, loss)
     for _ in range(REFINEMENTS):
         roots = np.sqrt(np.maximum(side[:, 1], 0.0))
         indices = np.flatnonzero(roots >= np.sqrt(RISE_95))
@@ -421,10 +443,14 @@ def _refine(side: Floats, problem: Problem, solution: Solution, n: int, loss: Lo
     return side
 
 
-def _unit(problem: Problem, solution: Solution, loss: Loss) -> tuple[float, float]:
-    """Return the increase of the cost that corresponds to 1 in -2 log L, and the minimum cost."""
+def _unit(problem: Problem, solution: Solution, n: int, loss: Loss) -> tuple[float, float]:
+    """Return the increase of the cost that corresponds to 1 in -2 log L, and the minimum cost.
+
+    Correlated residuals contain less information, by the square of the growth of the error.
+    """
     residuals = solution.at.residuals
-    return rise_of_loss(residuals, problem.size, loss), cost_of(residuals, loss)
+    growth = float(solution.growth[n]) ** 2
+    return growth * rise_of_loss(residuals, problem.size, loss), cost_of(residuals, loss)
 
 
 def _ends(unknown: Any) -> tuple[float, float]:
@@ -515,7 +541,8 @@ def sample_posterior(
     import emcee
 
     low, high = (bound[: len(problem.unknowns)] for bound in problem.bounds())
-    size = max(1.0, solution.ratio)
+    growth = solution.growth[: len(problem.unknowns)]
+    size = max(1.0, solution.ratio) * float(np.sqrt(np.mean(growth**2)))
 
     def log_posterior(values: Floats) -> float:
         if (values <= low).any() or (values >= high).any():

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
     from pbdkit.fitting.fit_result import Fitted
+    from pbdkit.fitting.specimens import FittedSpecimens
 
 
 PANEL_IN = 3.8
@@ -27,20 +28,31 @@ CURVE_IN = 2.5
 """Height of the panel of a curve in inches."""
 CURVES_PER_ROW = 3
 """Number of panels in a row of curves."""
+ROW_IN = 0.3
+"""Height of a specimen in inches."""
+NORMAL_95 = 1.96
+"""Half the width of a 95 % interval of a normal distribution, in standard deviations."""
 COLOUR_LIMIT = 3.0
 """Limit of the colour scale of residuals, in multiples of the noise."""
 
 
-def draw_fit(fitted: Fitted) -> Figure:
+def draw_fit(fitted: Fitted | FittedSpecimens) -> Figure:
     """Draw each measurement of a fit.
 
     A field has panels with ux and uy, measured and fitted. Further panels contain the residual,
     divided by the noise, and the sensitivity to each parameter. For wide bodies the panels are
     beside each other, otherwise below each other. For tracks and curves, the measured and the
-    fitted values, the residual and the sensitivity are drawn over time or displacement. Raises
-    ExperimentError if matplotlib is missing.
+    fitted values, the residual and the sensitivity are drawn over time or displacement.
+
+    For several specimens there is a panel for each parameter, with the estimate and the 95 %
+    interval of each specimen, the mean with its 95 % interval, and the mean with the standard
+    deviation between specimens. Raises ExperimentError if matplotlib is missing.
     """
     refuse_no_matplotlib()
+    from pbdkit.fitting.specimens import FittedSpecimens
+
+    if isinstance(fitted, FittedSpecimens):
+        return _draw_specimens(fitted)
     from pbdkit.plotting.figure_layout import new_figure
 
     count = 3 + len(fitted.values)
@@ -55,6 +67,33 @@ def draw_fit(fitted: Fitted) -> Figure:
     parts = figure.subfigures(len(kinds), 1, squeeze=False, height_ratios=heights)[:, 0]
     for n, (part, kind) in enumerate(zip(parts, kinds, strict=True)):
         (_draw_field if kind == "field" else _draw_curve)(part, fitted, n)
+    return figure
+
+
+def _draw_specimens(fitted: FittedSpecimens) -> Figure:
+    from pbdkit.plotting.figure_layout import new_figure
+
+    means, specimens = fitted.means, [*fitted.fits]
+    rows = [*specimens, "mean", "mean ± deviation"]
+    size = (PANEL_IN * len(means), MARGIN_IN + ROW_IN * len(rows))
+    figure = new_figure(figsize=size, dpi=150, layout="constrained")
+    axes = figure.subplots(1, len(means), squeeze=False, sharey=True)[0]
+    style: dict[str, Any] = {"fmt": "o", "markersize": 4, "linewidth": 1.2}
+    for ax, (name, mean) in zip(axes, means.items(), strict=True):
+        for row, specimen in enumerate(specimens):
+            estimate = fitted.estimate(specimen, name)
+            if estimate.identifiable:
+                error = NORMAL_95 * estimate.error
+                ax.errorbar(estimate.value, row, xerr=error, color="0.3", **style)
+        if mean.identifiable:
+            half = mean.interval[1] - mean.value
+            ax.axvline(mean.value, color="0.6", linewidth=0.8)
+            ax.errorbar(mean.value, len(specimens), xerr=half, color="C0", **style)
+            ax.errorbar(mean.value, len(specimens) + 1, xerr=mean.deviation, color="C1", **style)
+        ax.set_title(f"{name} ({mean.unit})" if mean.unit else name, fontsize=9)
+        ax.tick_params(labelsize=8)
+    axes[0].set_yticks(range(len(rows)), rows)
+    axes[0].set_ylim(len(rows) - 0.5, -0.5)
     return figure
 
 

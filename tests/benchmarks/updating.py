@@ -66,8 +66,8 @@ def own(a: float) -> Found:
     poisson, young = found.values[RATIO], found.youngs_modulus
     assert young
     return Found(
-        Estimate(poisson.value, poisson.error),
-        Estimate(young.value, young.error),
+        Estimate(poisson.value, poisson.error / poisson.growth),
+        Estimate(young.value, young.error / young.growth),
         found.ratio,
         found.as_dict()["evaluations"],
     )

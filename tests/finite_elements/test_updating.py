@@ -75,9 +75,10 @@ def test_pbdkit_matches_finite_element_updating(elements):
     found = pbdkit.fit(fit)
     own = found.values["rule.poisson_ratio"]
     assert abs(own.value - elements.poisson.value) < own.error
-    assert own.error == pytest.approx(elements.poisson.error, rel=0.03)
+    assert own.error / own.growth == pytest.approx(elements.poisson.error, rel=0.03)
     assert found.youngs_modulus.value == pytest.approx(elements.young.value, rel=1e-3)
-    assert found.youngs_modulus.error == pytest.approx(elements.young.error, rel=0.03)
+    young = found.youngs_modulus
+    assert young.error / young.growth == pytest.approx(elements.young.error, rel=0.03)
     assert found.ratio == pytest.approx(elements.ratio, rel=0.01)
 
 

@@ -234,3 +234,15 @@ def test_the_harmless_excess_is_a_quarter_of_the_standard_error(d: float) -> Non
     checked = strength.Checked.of([0.0, 0.1], np.exp([1.0 + d, 1.0 - d]))
     assert checked.limit == pytest.approx(0.25 * d)
     assert checked.bore_more == 1
+
+
+@pytest.mark.parametrize("span", [0.1, 3.0])
+def test_an_unidentified_parameter_is_uniform_between_its_bounds(span: float) -> None:
+    """The sum of two is measured with an error of 0.01, and the second alone is unknown: the first
+    has its variance, that of a uniform distribution."""
+    vectors = np.array([[1.0, 1.0], [1.0, -1.0]]) / np.sqrt(2.0)
+    variance = np.array([0.5e-4, problem.NULL_VARIANCE]) / span**2
+    directions = problem.Directions(vectors, variance, np.full(2, span))
+    error = directions.error_of(np.array([1.0, 0.0]), [1])
+    assert error == pytest.approx(np.sqrt(1e-4 + span**2 / 12.0))
+    assert directions.error_of(np.array([1.0, 1.0]), [0, 1]) == pytest.approx(0.01, rel=0.1)

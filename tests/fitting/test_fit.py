@@ -6,6 +6,7 @@ from __future__ import annotations
 import csv
 import json
 import re
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ import pytest
 from scene_strategies import in_turn
 
 import pbdkit
+from pbdkit.errors import AccuracyWarning, PbdkitWarning
 from pbdkit.fitting.observations import Interpolation
 from pbdkit.fitting.sensitivity import RestingScene
 from pbdkit.scene.scene import build_scene
@@ -299,6 +301,40 @@ def test_single_unidentifiable_parameter_gives_no_combination(tmp_path):
     found = fitted(in_series(rule=rule), tmp_path / "field.csv", unknown, 1e-4)
     assert [estimate.identifiable for estimate in found.values.values()] == [False, True]
     assert found.combinations == ()
+
+
+@pytest.mark.parametrize("bounds", [[0.0, 0.49], [0.29, 0.31]])
+def test_bounds_of_an_unidentified_parameter_do_not_hide_youngs_modulus(bounds, tmp_path):
+    """60 points determine E to 1 %, and Poisson's ratio to 0.02, which exceeds a quarter of the
+    narrower interval."""
+    made, path = plate(lattice={"type": "square", "a": 2.0}), tmp_path / "field.csv"
+    measured(made, path, noise=NOISE, count=60)
+    given = {"file": str(path), "noise": NOISE}
+    fit = {"experiment": made, "unknown": {"rule.poisson_ratio": bounds}, "measured": given}
+    found = pbdkit.fit(fit | {"modes": 3, "force": {"group": 1, "value": [0.2, 0.0]}})
+    estimate, young = found.values["rule.poisson_ratio"], found.youngs_modulus
+    assert estimate.identifiable == (bounds[0] == 0.0)
+    assert young.identifiable
+    assert young.error == pytest.approx(0.01 * young.value, rel=0.1)
+
+
+@pytest.mark.parametrize(("stated", "warned"), [(NOISE, False), (NOISE / 4.0, True)])
+def test_residuals_well_above_the_noise_are_reported(stated, warned, tmp_path):
+    made, path = plate(lattice={"type": "square", "a": 2.0}), tmp_path / "field.csv"
+    measured(made, path, noise=NOISE, count=100)
+    given = {"file": str(path), "noise": stated}
+    fit = {"experiment": made, "unknown": {"rule.poisson_ratio": [0.0, 0.49]}, "measured": given}
+    with warnings.catch_warnings(record=True) as issued:
+        warnings.simplefilter("always", PbdkitWarning)
+        found = pbdkit.fit(fit)
+    assert [each.category for each in issued] == [AccuracyWarning] * warned
+    assert found.as_dict()["warnings"] == [str(each.message) for each in issued]
+    for each in issued:
+        assert re.match(
+            r"measured: the residuals of the field are [34]\.\d times the noise of 0\.0001: .*"
+            "Correct `noise`, add terms",
+            str(each.message),
+        )
 
 
 def test_robust_loss_downweights_outliers(tmp_path):

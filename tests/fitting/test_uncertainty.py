@@ -143,7 +143,7 @@ def test_repeating_an_observation_leaves_the_posterior_unchanged(fit):
 
 def test_sampler_draws_from_the_posterior(fit):
     pytest.importorskip("emcee")
-    found = pbdkit.fit(fit | {"modes": 1, "sampler": {"walkers": 8, "steps": 24}})
+    found = pbdkit.fit(fit | {"sampler": {"walkers": 8, "steps": 24}})
     estimate, sample = found.values["rule.poisson_ratio"], found.sample
     assert sample.draws.shape == (8 * 18, 1)
     assert 0.2 < sample.acceptance < 0.95

@@ -132,9 +132,13 @@ class Truth:
 
 @cache
 def truth(name: str) -> Truth:
+    """Return the true field of a kind."""
+    return true_field(KINDS[name])
+
+
+def true_field(kind: Kind) -> Truth:
     """Return an equilibrium, bilinear between particles as in a fit; points in cells that lack a
     particle are left out."""
-    kind = KINDS[name]
     diagnostics: list[dict[str, Any]] = [{"type": "displacement"}]
     if kind.forced:
         diagnostics.append({"type": "reaction", "youngs_modulus": MODULUS, "thickness": 1.0})
