@@ -18,13 +18,13 @@ from pbdkit.fitting.crack_tip import locate_tip
 from pbdkit.fitting.derived import derive, refuse_other_names
 from pbdkit.fitting.fit_file import Fit
 from pbdkit.fitting.fit_result import Fitted, fitted
+from pbdkit.fitting.modes import least_size, solve
 from pbdkit.fitting.observations import FieldObservation, Observation
 from pbdkit.fitting.parameter import Parameter
 from pbdkit.fitting.problem import (
     Problem,
     Solution,
     Unknown,
-    solved,
     with_correlated_errors,
 )
 from pbdkit.fitting.specimens import FittedSpecimens, combine_specimens
@@ -179,7 +179,7 @@ def _compare_candidates(
             problem,
             observations=tuple(observation.with_noise(noise) for observation, noise in pairs),
         )
-        models.append(SolvedProblem(name, problem, solved(problem, problem.start(), fit.loss)))
+        models.append(SolvedProblem(name, *solve(problem, problem.start(), fit.loss)))
     return compare_models(models, fit.folds, fit.loss, seed=0)
 
 
@@ -267,10 +267,10 @@ def _refuse_beyond(unknown: Unknown, experiment: Experiment) -> None:
 
 def _refuse_underdetermined(problem: Problem) -> None:
     count = sum(len(observation.measured) for observation in problem.observations)
-    if count < problem.size:
-        separate = problem.size - problem.shared
+    if count < (size := least_size(problem)):
+        separate = size - problem.shared
         raise ExperimentError(
-            f"{count} measured numbers cannot determine {problem.size} unknowns, {separate} of "
+            f"{count} measured numbers cannot determine {size} unknowns, {separate} of "
             "which are `modes` of boundaries and terms of `distortion`; use fewer of these",
             ("measured", "file"),
         )
@@ -282,13 +282,13 @@ def _solve(problem: Problem, fit: Fit) -> tuple[Problem, Solution]:
     The standard errors account for correlated residuals.
     """
     if fit.measured[0].noise is not None:
-        solution = solved(problem, problem.start(), fit.loss)
+        problem, solution = solve(problem, problem.start(), fit.loss)
         return problem, with_correlated_errors(problem, solution, fit.loss)
     (observation,) = problem.observations
     problem = replace(
         problem, observations=(observation.with_noise(TINY * _size(observation.measured)),)
     )
-    solution = solved(problem, problem.start())
+    problem, solution = solve(problem, problem.start(), "linear")
     # A robust loss identifies outliers by means of the noise, so that the fit and the noise are
     # computed twice.
     for _ in range(1 if fit.loss == "linear" else 2):
@@ -297,7 +297,7 @@ def _solve(problem: Problem, fit: Fit) -> tuple[Problem, Solution]:
         problem = replace(
             problem, observations=(observation.with_noise(ratio * observation.noise),)
         )
-        solution = solved(problem, solution.z, fit.loss)
+        problem, solution = solve(problem, solution.z, fit.loss)
     return problem, with_correlated_errors(problem, solution, fit.loss)
 
 

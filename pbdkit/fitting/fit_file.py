@@ -32,6 +32,7 @@ from pbdkit.fitting.observations import (
     CurveObservation,
     FieldEvidence,
     FieldObservation,
+    Modes,
     Observation,
     TracksObservation,
     deeper,
@@ -85,6 +86,8 @@ SpecimenName = Annotated[
     str, BeforeValidator(lambda name: str(name), json_schema_input_type=str | int)
 ]
 """Name of a specimen; a number is read as text."""
+Count = Annotated[int, Field(ge=0, le=40)] | Literal["auto"]
+ModesOfGroups = Modes | tuple[Modes, ...]
 DIRECTIONS = {"x": (1.0, 0.0), "y": (0.0, 1.0)}
 """Unit vectors of the axes."""
 
@@ -139,7 +142,7 @@ class MeasuredColumns(Component):
         return self.noise or GUESS
 
     @abstractmethod
-    def observation(self, experiment: Experiment, modes: int) -> Observation:
+    def observation(self, experiment: Experiment, modes: ModesOfGroups) -> Observation:
         """Return the observation of this measurement.
 
         Parameters
@@ -147,7 +150,7 @@ class MeasuredColumns(Component):
         experiment
             The experiment with the settings of this measurement.
         modes
-            Number of modes of displacements along measured boundaries.
+            Numbers of modes of displacements along measured boundaries.
 
         Raises
         ------
@@ -212,7 +215,7 @@ class MeasuredField(MeasuredColumns):
     distortion: Distortion = Field(default_factory=Distortion)
     force: Force | None = None
 
-    def observation(self, experiment: Experiment, modes: int) -> FieldObservation:
+    def observation(self, experiment: Experiment, modes: ModesOfGroups) -> FieldObservation:
         """Return the observation of an equilibrium. The solver of the experiment is not used."""
         if experiment.solver.makes_steps:
             experiment = experiment.model_copy(update={"solver": Equilibrium()})
@@ -241,7 +244,7 @@ class MeasuredTracks(MeasuredColumns):
         "uy",
     )
 
-    def observation(self, experiment: Experiment, modes: int) -> TracksObservation:
+    def observation(self, experiment: Experiment, modes: ModesOfGroups) -> TracksObservation:
         """Return the observation of a run."""
         times, points, u = self.rows[:, 0], self.rows[:, 1:3], self.rows[:, 3:]
         return TracksObservation.of(experiment, times, points, u, self.assumed_noise)
@@ -261,7 +264,7 @@ class MeasuredCurve(MeasuredColumns):
     youngs_modulus: Positive | None = None
     columns: Annotated[tuple[str, str], Field(strict=False)] = ("displacement", "force")
 
-    def observation(self, experiment: Experiment, modes: int) -> CurveObservation:
+    def observation(self, experiment: Experiment, modes: ModesOfGroups) -> CurveObservation:
         """Return the observation of a run.
 
         Forces are divided by the thickness and by a known modulus.
@@ -384,9 +387,10 @@ class Fit(Strict):
     measurements, which are fields in equilibrium, tracks or curves.
 
     If a leader group has the motion `measured`, its displacement along each axis is a sum of
-    `modes` smooth functions with amplitudes that are also fitted. If `modes` is 0, the measured
-    displacements are prescribed. `loss` is the loss function of the residuals. All functions except
-    `linear` reduce the weight of outliers.
+    `modes` smooth functions with amplitudes that are also fitted. By default, `auto`, the data
+    determine their number for each group. A list has a number or `auto` for each of these groups.
+    If the number is 0, the measured displacements are prescribed. `loss` is the loss function of
+    the residuals. All functions except `linear` reduce the weight of outliers.
 
     With `specimens: true`, the measurements are of several specimens of one material, which differ.
     Each specimen is fitted separately. The result contains the mean of each parameter over the
@@ -410,7 +414,7 @@ class Fit(Strict):
     measured: Measurements
     specimens: bool = False
     force: Force | None = None
-    modes: Annotated[int, Field(ge=0, le=40)] = 6
+    modes: Count | Annotated[tuple[Count, ...], Field(strict=False)] = "auto"
     loss: Loss = "linear"
     profile: Annotated[tuple[str, ...], Field(strict=False)] = ()
     sampler: Sampler | None = None

@@ -310,6 +310,10 @@ class Fitted:
             "youngs_modulus": None if modulus is None else modulus.as_dict(),
             "residual_over_noise": self.ratio,
             "measured": [asdict(misfit) for misfit in self.misfits],
+            "modes": [
+                {str(group): count for group, count in self.modes(n).items()}
+                for n in range(len(self.misfits))
+            ],
             "warnings": [*map(str, self.warnings)],
             "evaluations": self.solution.evaluations,
         } | self._on_request()
@@ -367,6 +371,24 @@ class Fitted:
         return FittedField(
             evidence.points, measured.reshape(2, -1).T, np.asarray(residual.reshape(2, -1).T)
         )
+
+    def modes(self, n: int = 0) -> dict[int, int]:
+        """Return the numbers of modes of the measured boundaries of a field.
+
+        Parameters
+        ----------
+        n : int
+            Number of the measurement, from 0.
+
+        Returns
+        -------
+        dict of int to int
+            Numbers of modes by leader group.
+        """
+        observation = self.problem.observations[n]
+        if not isinstance(observation, FieldObservation):
+            return {}
+        return {boundary.group: boundary.count for boundary in observation.boundaries}
 
     def distortions(self, n: int = 0) -> dict[str, Estimate]:
         """Return the fitted amplitudes of the distortions of a measured field.
@@ -470,10 +492,13 @@ class Fitted:
             for m, second in list(enumerate(self.values))[n + 1 :]:
                 if abs(self.correlations[n, m]) > 0.5:
                     yield f"correlation of {first} and {second}: {self.correlations[n, m]:.2f}"
-        for misfit in self.misfits:
+        for n, misfit in enumerate(self.misfits):
             yield str(misfit)
             if misfit.correlation:
                 yield f"  {misfit.correlation}"
+            if counts := self.modes(n):
+                each = ", ".join(f"{count} of group {group}" for group, count in counts.items())
+                yield f"modes of measured boundaries: {each}"
         if any(misfit.correlation for misfit in self.misfits):
             yield f"the correlation increases standard errors: {', '.join(self._growths())}"
         for path, profile in self.profiles.items():

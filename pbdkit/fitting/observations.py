@@ -19,7 +19,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property, reduce
 from itertools import combinations
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 import shapely
@@ -70,18 +70,43 @@ class Boundary:
     ----------
     group, leading
         Number of the leader group, and the group.
-    modes : (particle, mode)
+    polynomials : (particle, mode)
         Polynomials along the boundary.
+    count
+        Number of polynomials that are modes of the boundary, from the first.
+    is_automatic
+        Whether the data determine this number.
     """
 
     group: int
     leading: Leading
-    modes: Floats
+    polynomials: Floats
+    count: int
+    is_automatic: bool = False
+
+    @property
+    def modes(self) -> Floats:
+        """Return the polynomials that are used, (particle, mode)."""
+        return self.polynomials[:, : self.count]
+
+    @property
+    def largest(self) -> int:
+        """Return the largest possible number of modes."""
+        return int(self.polynomials.shape[1]) if self.is_automatic else self.count
 
     @property
     def size(self) -> int:
         """Return the number of coefficients, one for each mode and axis."""
-        return int(self.modes.shape[1]) * len(self.leading.axes)
+        return self.count * len(self.leading.axes)
+
+    def coefficients_of(self, other: Boundary, coefficients: Floats) -> Floats:
+        """Return the coefficients for those of the same boundary with another number of modes.
+
+        Coefficients of modes that the other one lacks are 0.
+        """
+        values = np.zeros((len(self.leading.axes), max(self.count, other.count)))
+        values[:, : other.count] = coefficients.reshape(len(values), -1)
+        return values[:, : self.count].ravel()
 
     def start(self, steps: int) -> Floats:
         """Fit the coefficients to the measured displacements, (axis · mode,)."""
@@ -116,28 +141,63 @@ class Boundary:
 
         The result is a raster for each axis and sublattice, (axis, sublattice, cell, cell).
         """
-        axis, mode = divmod(n, self.modes.shape[1])
+        axis, mode = divmod(n, self.count)
         planes = np.zeros((scene.axes, *scene.raster.shape))
         flat = planes.reshape(scene.axes, -1)
         flat[self.leading.axes[axis], self.leading.place] = self.modes[:, mode]
         return planes
 
 
-def boundaries(scene: Scene, modes: int) -> tuple[Boundary, ...]:
+MAX_MODES = 12
+"""Largest number of modes that is chosen for a boundary."""
+INITIAL_MODES = 4
+"""Number of modes before it is chosen."""
+AUTOMATIC = "auto"
+"""Number of modes that the data determine."""
+Modes = int | Literal["auto"]
+"""Number of modes of a boundary; with 0 the measured displacements are prescribed."""
+
+
+def boundaries(scene: Scene, modes: Modes | Sequence[Modes]) -> tuple[Boundary, ...]:
     """Return the boundaries of all groups that move by `measured`.
+
+    Parameters
+    ----------
+    modes
+        Number of modes of all of these groups, or of each.
 
     Raises
     ------
     ExperimentError
         If a group is not on a line, has too few particles, or shares a prescribed particle with
-        another group.
+        another group, or if the number of `modes` is not that of the groups.
     """
-    result = []
-    for n, leading in enumerate(scene.leading):
-        if isinstance(leading.group.motion, Measured):
-            _refuse_shared(scene, n)
-            result.append(Boundary(n, leading, _polynomials(leading.reference, modes, n)))
-    return tuple(result)
+    groups = [
+        (n, leading)
+        for n, leading in enumerate(scene.leading)
+        if isinstance(leading.group.motion, Measured)
+    ]
+    counts = [modes] * len(groups) if isinstance(modes, int | str) else [*modes]
+    if len(counts) != len(groups):
+        raise ExperimentError(
+            f"expected a number for each of the {len(groups)} leader groups with the motion "
+            f"`measured`, got {len(counts)}",
+            ("modes",),
+        )
+    return tuple(
+        _boundary(scene, n, leading, count)
+        for (n, leading), count in zip(groups, counts, strict=True)
+        if count != 0
+    )
+
+
+def _boundary(scene: Scene, n: int, leading: Leading, modes: Modes) -> Boundary:
+    _refuse_shared(scene, n)
+    points = leading.reference
+    if modes == AUTOMATIC:
+        polynomials = _polynomials(points, min(MAX_MODES, len(points)), n)
+        return Boundary(n, leading, polynomials, min(INITIAL_MODES, len(points)), is_automatic=True)
+    return Boundary(n, leading, _polynomials(points, int(modes), n), int(modes))
 
 
 def _refuse_shared(scene: Scene, n: int) -> None:
@@ -162,6 +222,11 @@ def _refuse_shared(scene: Scene, n: int) -> None:
 
 def _polynomials(points: Floats, modes: int, n: int) -> Floats:
     """Return Legendre polynomials along a line, (particle, mode)."""
+    if len(points) < 2:
+        raise ExperimentError(
+            "a measured boundary needs two particles or more; use the motion `displace` for one",
+            ("leaders", n, "select"),
+        )
     middle = points.mean(axis=0)
     _, sizes, directions = np.linalg.svd(points - middle, full_matrices=False)
     if sizes[1] > MAX_LINE_DEVIATION * sizes[0]:
@@ -993,7 +1058,7 @@ class FieldObservation(Observation):
         scene: Scene,
         evidence: FieldEvidence,
         noise: float,
-        modes: int,
+        modes: Modes | Sequence[Modes],
         mask: NDArray[np.bool_] | None = None,
     ) -> FieldObservation:
         """Return the observation of a field.
@@ -1001,7 +1066,8 @@ class FieldObservation(Observation):
         Parameters
         ----------
         modes
-            Number of modes along each measured boundary; 0 prescribes the measured displacements.
+            Number of modes along each measured boundary, or along all of them; 0 prescribes the
+            measured displacements, and `auto` leaves the choice to the data.
         mask
             Mask of the rows from which `evidence` was selected.
         """
@@ -1016,7 +1082,7 @@ class FieldObservation(Observation):
             left_out_because=OUTSIDE + (NEAR if mask is not None and not mask.all() else ""),
             scene=scene,
             evidence=evidence,
-            boundaries=boundaries(scene, modes) if modes else (),
+            boundaries=boundaries(scene, modes),
         )
 
     @property

@@ -27,6 +27,7 @@ from pbdkit.errors import ExperimentError
 from pbdkit.fitting.correlation import Correlation, estimate_correlation, is_correlated
 from pbdkit.fitting.observations import FieldObservation, NearbyPrediction, Observation, Prediction
 from pbdkit.fitting.parameter import Parameter
+from pbdkit.fitting.residual_pattern import remedy_of
 from pbdkit.fitting.sensitivity import scene_like
 from pbdkit.model.experiment import Experiment
 from pbdkit.stepping.state import initial_state
@@ -225,18 +226,25 @@ class Problem:
         """Return initial values.
 
         If bounds are wide and a field is measured, the parameters minimise the equilibrium gap.
-        Otherwise they are in the middle of their bounds. Boundaries have their measured
-        displacements.
+        Otherwise they are in the middle of their bounds or, if the experiment is not valid there,
+        have the values of the experiment. Boundaries have their measured displacements.
         """
         z, count = np.zeros(self.size), len(self.unknowns)
         low, high = (bound[:count] for bound in self.bounds())
         z[:count] = (low + high) / 2.0
         fields = [item for item in self.observations if isinstance(item, FieldObservation)]
-        is_wide = (low > 0.0) & (high > WIDE * low)
-        if fields and is_wide.any():
-            parameters = [u.parameter for u in self.unknowns]
+        parameters = [u.parameter for u in self.unknowns]
+        is_wide = [unknown.is_wide for unknown in self.unknowns]
+        if fields and any(is_wide):
             guess = least_gap(fields[0], parameters, low, high)
             z[:count] = np.where(is_wide, guess, z[:count])
+        try:
+            for observation in self.observations:
+                self.experiment_at(observation, z)
+        except ExperimentError:
+            experiment, inset = self.observations[0].experiment, INSET * (high - low)
+            values = [parameter.value_in(experiment) for parameter in parameters]
+            z[:count] = np.clip(values, low + inset, high - inset)
         for observation, section in self.own_slices():
             z[section] = observation.start()
         return self.with_best_modulus(z)
@@ -366,10 +374,12 @@ GOOD_GAIN = 0.7
 """Fraction of the predicted decrease from which the trust region becomes larger."""
 SETTLED = 1e-3
 """Relative decrease of the cost below which the linear unknowns are not changed."""
-STALLED = 0.1
-"""Largest step, in standard errors, of a fit that has converged if no step reduces the cost.
+STALLED = 0.5
+"""Largest remaining step, in standard errors, of a fit that has converged if no step reduces the
+cost.
 
-It then is limited by the accuracy of the derivatives.
+The cost then has a kink: where bonds are broken, the stiffness of cells is not a smooth function of
+the parameters of `orthotropic`.
 """
 
 SLACK = 1e-9
@@ -377,8 +387,9 @@ SLACK = 1e-9
 MAX_REWEIGHTINGS = 100
 """Maximum number of iteratively reweighted linear problems."""
 
-STEADY = 1e-6
-"""Largest change of the residuals after which the weights have converged."""
+STEADY = 1e-5
+"""Largest change of the residuals, in units of the noise, after which the weights have
+converged."""
 
 RANK = 1e-5
 """Relative tolerance of singular values, for columns of unit length.
@@ -644,9 +655,7 @@ class _Region:
         at = self.problem.at(z, near)
         if not at.is_linear:
             return at
-        free = np.full(len(z), np.inf)
-        free[: len(self.problem.unknowns)] = 0.0
-        step = _linear_step(at, -free, free, self.loss)
+        step = _step_of_others(self.problem, at, self.loss)
         cost = cost_of(at.residuals, self.loss)
         if cost - cost_of(at.residuals - at.jacobian @ step, self.loss) <= SETTLED * cost:
             return at
@@ -669,8 +678,24 @@ class _Region:
 
     def explain(self, at: Linearisation) -> str:
         """Return why the fit has not converged, and a remedy."""
-        reason = f" ({self.failure})" if self.failure else ""
-        return f"no step reduces the cost{reason}; narrow the bounds, or start closer"
+        pairs = zip(self.problem.unknowns, at.z, strict=False)
+        values = ", ".join(f"{unknown.parameter.path} = {value:.4g}" for unknown, value in pairs)
+        text = f"no step from {values} reduces the cost"
+        if self.radius >= MIN_RADIUS:
+            text = f"the fit has not converged after {MAX_ITERATIONS} iterations, at {values}"
+        if self.failure:
+            return f"{text}; near these values there is no prediction: {self.failure}"
+        if bounds := _on_bounds(self.problem, at.z):
+            return f"{text}; widen the bounds of {', '.join(bounds)}, at which the fit stops"
+        residuals = [at.residuals[rows] for _, rows in self.problem.rows()]
+        return f"{text}; {remedy_of(self.problem.observations, residuals, self.loss)}"
+
+
+def _step_of_others(problem: Problem, at: Linearisation, loss: Loss) -> Floats:
+    """Solve the linearised problem for all unknowns that are not parameters."""
+    free = np.full(problem.size, np.inf)
+    free[: len(problem.unknowns)] = 0.0
+    return _linear_step(at, -free, free, loss)
 
 
 def _linear_step(at: Linearisation, low: Floats, high: Floats, loss: Loss) -> Floats:
@@ -692,6 +717,16 @@ def _linear_step(at: Linearisation, low: Floats, high: Floats, loss: Loss) -> Fl
     step = np.zeros(len(is_free))
     step[is_free] = y / size
     return step
+
+
+def weighted_system(at: Linearisation, loss: Loss) -> tuple[Floats, Floats]:
+    """Return Jacobian and residuals, multiplied by the square roots of the weights of a loss.
+
+    The weights are those of residuals divided by their spread if it exceeds the noise.
+    """
+    size = max(1.0, spread_of(at.residuals, 0, loss))
+    weight = np.sqrt(_weight(at.residuals / size, loss))
+    return at.jacobian * weight[:, None], at.residuals * weight
 
 
 def _solve_bounded(matrix: Floats, values: Floats, low: Floats, high: Floats) -> Floats:

@@ -157,7 +157,7 @@ def test_sampler_draws_from_the_posterior(fit):
 
 def test_missing_sampler_is_named_before_the_fit(fit, monkeypatch):
     monkeypatch.setattr("pbdkit.errors.find_spec", lambda library: None)
-    monkeypatch.setattr("pbdkit.fitting.fit.solved", None)
+    monkeypatch.setattr("pbdkit.fitting.fit.solve", None)
     with pytest.raises(pbdkit.ExperimentError, match=r"pip install 'pbdkit\[sample\]'"):
         pbdkit.fit(fit | {"sampler": {"walkers": 8, "steps": 24}})
 
