@@ -16,7 +16,7 @@ COARSE = {"lattice": {"type": "square", "a": 2.0}}
 
 @pytest.fixture(scope="module")
 def fit_with(tmp_path_factory):
-    """Fit a plate whose ends move by polynomials of the second and third degree."""
+    """Fit a plate with ends that move by polynomials of the second and third degree."""
 
     def fit(noise, modes):
         generator = np.random.default_rng(4)
