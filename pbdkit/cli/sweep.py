@@ -26,13 +26,15 @@ from pbdkit.plotting.fit_figures import draw_fit
 from pbdkit.plugin.registry import Registry
 from pbdkit.progress import Stop, progress_bar, stop_on_signals, waiting
 from pbdkit.sweeps.execute import Summary, carry_out, executor_of
-from pbdkit.sweeps.specification import SweepPlan, read_sweep, sweep_schema
+from pbdkit.sweeps.specification import Member, SweepPlan, read_sweep, sweep_schema
 
 CONNECT_S = 10.0
 """Timeout for the connection to a cluster in seconds."""
 MAX_LISTED = 20
 """Maximum number of failures that are listed. The variable `message` of the dataset contains all of
 them."""
+MAX_NAMED = 3
+"""Maximum number of separated members of which the parameters are printed."""
 
 
 def sweep(
@@ -50,7 +52,7 @@ def sweep(
         summary = carry_out(plan, path, executor_of(workers, client), stopping, show)
     for fault in summary.faults:
         click.echo(f"warning: {fault}", err=True)
-    return _report_end(summary, path, stopping, quiet)
+    return report_end(summary, path, stopping, quiet)
 
 
 def _refuse_folder(folder: Path) -> None:
@@ -84,7 +86,7 @@ def _client(address: str | None) -> Iterator[Any]:
         yield client
 
 
-def _report_end(summary: Summary, folder: Path, stop: Stop, quiet: bool) -> int:
+def report_end(summary: Summary, folder: Path, stop: Stop, quiet: bool) -> int:
     """Print the outcome of the sweep, and return the exit status."""
     count, missing = len(summary.members), len(summary.members) - len(summary.ends)
     failures = summary.failures
@@ -98,10 +100,22 @@ def _report_end(summary: Summary, folder: Path, stop: Stop, quiet: bool) -> int:
     if not quiet:
         stored = count - summary.run
         remark = f" ({summary.run} run now, {stored} stored before)" if stored else ""
-        click.echo(f"{count - len(failures)} of {count} members complete{remark}: {summary.path}")
+        separated = summary.separated
+        complete = count - len(failures) - len(separated)
+        outcome = f"{complete} of {count} members complete{_separated(separated)}"
+        click.echo(f"{outcome}{remark}: {summary.path}")
     if failures:
         _show(summary)
     return 5 if failures else 0
+
+
+def _separated(members: list[Member]) -> str:
+    """Return the number of separated members and the parameters of the first ones."""
+    if not members:
+        return ""
+    words = [member.words for member in members[:MAX_NAMED]]
+    rest = [f"and {len(members) - MAX_NAMED} more"] if len(members) > MAX_NAMED else []
+    return f", {len(members)} separated ({'; '.join(words + rest)})"
 
 
 def _show(summary: Summary) -> None:

@@ -54,8 +54,8 @@ def member(dataset: xarray.Dataset, choice: Mapping[str, Any]) -> xarray.Dataset
     dataset : xarray.Dataset
         The dataset of a sweep.
     choice : mapping
-        Values by the names of parameters. A value is a number, or text such as the `type` of a
-        part.
+        Values by the names of parameters. A value is a number, a text with a number and its unit,
+        or text such as the `type` of a part.
 
     Raises
     ------
@@ -87,7 +87,7 @@ def choices(dataset: xarray.Dataset) -> str:
     for dim in map(str, dataset[STATUS].dims):
         words = [_word(value) for value in _labels(dataset, dim)[:MAX_SHOWN]]
         ellipsis = ", ..." if dataset.sizes[dim] > MAX_SHOWN else ""
-        parts.append(f"{dim}: {', '.join(words)}{ellipsis}")
+        parts.append(f"{dim}: {', '.join(words)}{ellipsis}{_unit_of(dataset, dim)}")
     return "; ".join(parts)
 
 
@@ -98,6 +98,13 @@ def _labels(dataset: xarray.Dataset, name: str) -> NDArray[Any]:
         if label in dataset.coords:
             return np.asarray(dataset[label].values)
     return np.arange(dataset.sizes[name])
+
+
+def _unit_of(dataset: xarray.Dataset, name: str) -> str:
+    """Return the unit of the labels along a dimension, after a space; empty if there is none."""
+    units = str(dataset[name].attrs.get("units", "1")) if name in dataset.coords else "1"
+    has_unit = units != "1" and f"{name}{TEXT}" not in dataset.coords
+    return f" {units}" if has_unit else ""
 
 
 def _word(value: Any) -> str:
@@ -115,11 +122,33 @@ def _place(dataset: xarray.Dataset, name: str, value: Any) -> tuple[str, int]:
             f"{name}: is not a parameter of this sweep{hint} ({choices(dataset)})"
         )
     labels = _labels(dataset, name)
-    rows = [row for row, label in enumerate(labels.tolist()) if _is_alike(label, value)]
+    number = _in_unit_of(dataset, name, value)
+    rows = [row for row, label in enumerate(labels.tolist()) if _is_alike(label, number)]
     if not rows:
-        near = ", ".join(map(_word, labels.tolist()[:MAX_SHOWN]))
+        near = ", ".join(map(_word, labels.tolist()[:MAX_SHOWN])) + _unit_of(dataset, name)
         raise ExperimentError(f"{name}={value}: no member has this value; there are {near}")
     return dims[name], rows[0]
+
+
+def _in_unit_of(dataset: xarray.Dataset, name: str, value: Any) -> Any:
+    """Convert a text with a unit to a number in the unit of a parameter. Return any other value
+    unchanged."""
+    unit = _unit_of(dataset, name).strip()
+    if not unit or not isinstance(value, str) or not value[-1:].isalpha():
+        return value
+    from pydantic_core import PydanticCustomError
+
+    from pbdkit.plugin.units import QUANTITIES, Scales, magnitude
+
+    experiment = json_attribute(dataset, SWEEP).get("experiment") or {}
+    scales = Scales.model_validate({"units": experiment.get("units")}).units
+    quantity = QUANTITIES.get(unit)
+    try:
+        if quantity is None or scales is None:
+            return magnitude(value, unit, f"value in {unit}")
+        return magnitude(value, quantity.unit, quantity.meaning) / scales.scale(quantity)
+    except PydanticCustomError as error:
+        raise ExperimentError(f"{name}={value}: {error.message()}") from None
 
 
 def _is_alike(label: Any, value: Any) -> bool:

@@ -329,6 +329,21 @@ def magnitude(text: str, unit: str, meaning: str) -> float:
         raise _fault(f"'{text}' is not a {meaning}; {hint}") from None
 
 
+def is_unit(name: str) -> bool:
+    """Return whether a text is the name of a unit. Without pint it is unknown, and False."""
+    if not UNIT.fullmatch(name):
+        return False
+    try:
+        pint, registry = _registry()
+    except PydanticCustomError:
+        return False
+    try:
+        registry.parse_units(name)
+    except (pint.PintError, ArithmeticError, ValueError):
+        return False
+    return True
+
+
 def _is_of(text: str, unit: str) -> bool:
     """Return whether a text is a number with a unit of the same dimension as `unit`."""
     try:

@@ -308,6 +308,33 @@ def wide_sections(
             )
 
 
+def groups_without_reaction(experiment: Experiment) -> Iterator[str]:
+    """Generate a warning for each diagnostic `stress-strain` with a leader group that does not
+    prescribe the motion along its axis, so that its nominal stress is 0."""
+    diagnostics: tuple[Any, ...] = experiment.diagnostics
+    for n, diagnostic in enumerate(diagnostics):
+        if diagnostic.type != "stress-strain" or diagnostic.group >= len(experiment.leaders):
+            continue
+        axis, index = diagnostic.axis, "xy".index(diagnostic.axis)
+        axes = experiment.leaders[diagnostic.group].axes
+        if axes is None or axis in axes:
+            continue
+        loads = [
+            f"loads.{m}"
+            for m, load in enumerate(experiment.loads)
+            if load.force_at(load.from_)[index] or load.force_at(load.last(experiment.steps))[index]
+        ]
+        others = [m for m, group in enumerate(experiment.leaders) if axis in (group.axes or "xy")]
+        remedy = f"choose a group that prescribes it ({', '.join(map(str, others)) or 'none does'})"
+        if loads:
+            remedy = f"the body is loaded by {', '.join(loads)}: use `load-displacement`"
+        yield (
+            f"diagnostics.{n}.group: leader group {diagnostic.group} does not prescribe the motion "
+            f"along {axis}, so that it exerts no force along {axis} and the nominal stress is 0; "
+            f"{remedy}"
+        )
+
+
 def angles_in_radians(experiment: Experiment) -> Iterator[str]:
     """Generate a warning for each angle, or total rotation, that is a multiple of `ROUND_ANGLE` and
     therefore seems to be given in radians."""

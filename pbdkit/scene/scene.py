@@ -389,6 +389,7 @@ def _build(experiment: Experiment, ground: LatticeSetup) -> Scene:
         *checks.without_effect(experiment, raster),
         *checks.far_from_the_body(experiment, raster),
         *checks.wide_sections(experiment, raster, box),
+        *checks.groups_without_reaction(experiment),
     ]
     warnings += [*checks.angles_in_radians(experiment), *checks.locking(experiment, raster, box)]
     warnings += checks.coarse_arcs(experiment, raster)

@@ -60,6 +60,7 @@ from pbdkit.sweeps.store import Store
 from pbdkit.sweeps.worker import (
     INTERRUPTED,
     LOST,
+    SEPARATED,
     STORED_STATUSES,
     MemberReport,
     begin_worker,
@@ -355,6 +356,11 @@ class Summary:
     run: int
     faults: list[str]
     path: Path | None
+
+    @property
+    def separated(self) -> list[Member]:
+        """The members with values of which the body came apart before the last step."""
+        return [m for m in self.members if self.ends.get(m.job.key, ("",))[0] == SEPARATED]
 
     @property
     def failures(self) -> list[tuple[Member, str, str]]:
@@ -669,6 +675,10 @@ def called(
                 f"is {status}"
             )
             warn_caller(f"{text}: {member.words}: {message}", SweepWarning)
+        if separated := summary.separated:
+            text = f"{len(separated)} of {len(summary.members)} members are separated"
+            message = summary.ends[separated[0].job.key][1]
+            warn_caller(f"{text}; the first is {separated[0].words}: {message}", SweepWarning)
         assert summary.path is not None  # The sweep can be stopped by an exception only.
         dataset = open_result(summary.path)
         if folder is None:

@@ -32,7 +32,7 @@ from pbdkit.model.shipped import shipped_names, shipped_text
 from pbdkit.model.validation import brief, fault, report
 from pbdkit.plugin import Component
 from pbdkit.plugin.component import Strict
-from pbdkit.plugin.units import TEXT as WITH_UNIT, Quantity
+from pbdkit.plugin.units import TEXT as WITH_UNIT, Quantity, is_unit, magnitude
 from pbdkit.seeds import replicate_seeds
 
 MAX_MEMBERS = 100_000
@@ -89,7 +89,9 @@ def _listed(value: Any) -> tuple[Any, ...]:
             )
         value = Range.model_validate(value).values()
     if not isinstance(value, list) or not value:
-        raise fault(f"expected a list of values or {{from, to, count}}, got {brief(value)}")
+        remedy = f"; write [{brief(value)}]" if isinstance(value, (str, int, float)) else ""
+        raise fault(f"expected a list of values or {{from, to, count}}, got {brief(value)}{remedy}")
+    value = _in_one_unit(value)
     try:
         texts = [json.dumps(item, sort_keys=True, allow_nan=False) for item in value]
     except (TypeError, ValueError):
@@ -100,6 +102,31 @@ def _listed(value: Any) -> tuple[Any, ...]:
         duplicate = next(item for n, item in enumerate(value) if texts.index(texts[n]) < n)
         raise fault(f"{brief(duplicate)} is listed twice")
     return tuple(value)
+
+
+def _in_one_unit(values: list[Any]) -> list[Any]:
+    """Convert values with different units to the unit of the first value.
+
+    Texts of which one is no number with a known unit are returned unchanged.
+    """
+    parts = [WITH_UNIT.fullmatch(value) if isinstance(value, str) else None for value in values]
+    units = [part[2] for part in parts if part]
+    are_numbers = all(
+        part or type(value) in (int, float) for part, value in zip(parts, values, strict=True)
+    )
+    if units and are_numbers and len(units) < len(values):
+        plain_value = next(value for part, value in zip(parts, values, strict=True) if not part)
+        raise fault(
+            f"{brief(plain_value)} has no unit, but other values have one; write all values with "
+            "their units, or all as numbers of lattice units"
+        )
+    if len(units) < len(values) or len(set(units)) == 1:
+        return values
+    if not all(is_unit(unit) for unit in units):
+        return values
+    unit = units[0]
+    numbers = [magnitude(value, unit, f"quantity in {unit} as '{values[0]}'") for value in values]
+    return [f"{number:.{DIGITS}g} {unit}" for number in numbers]
 
 
 Values = Annotated[

@@ -76,7 +76,9 @@ def unpacked(content: bytes) -> dict[str, MemberVariable]:
     return variables
 
 
-STORED_STATUSES = (*WHOLE, "separated")
+SEPARATED = "separated"
+"""Status of members with a body that came apart."""
+STORED_STATUSES = (*WHOLE, SEPARATED)
 """Status of members with values in the dataset.
 
 A run with the status "separated" ended because its body separated into parts in the equilibrium

@@ -122,6 +122,24 @@ def test_section_wider_than_the_body_has_a_warning() -> None:
     assert warnings_of(diagnostics=[gauge | {"axis": "y", "width": 3.1}]) == []
 
 
+def test_group_without_reaction_along_the_axis_has_a_warning() -> None:
+    leaders = [
+        {"select": {"edge": "left"}, "motion": HOLD, "axes": ["x"]},
+        {"select": {"edge": "bottom"}, "motion": HOLD, "axes": ["y"]},
+    ]
+    gauge = GAUGE | {"points": [[0.5, 1.0], [3.5, 1.0]]}
+    assert warnings_of(leaders=leaders, diagnostics=[gauge]) == []
+    idle = {"leaders": leaders, "diagnostics": [gauge | {"group": 1}]}
+    (text,) = warnings_of(**idle)
+    assert text == (
+        "diagnostics.0.group: leader group 1 does not prescribe the motion along x, so that it "
+        "exerts no force along x and the nominal stress is 0; choose a group that prescribes it (0)"
+    )
+    ramp = {"select": {"edge": "right"}, "force": [{"steps": [0, 5], "values": [0.0, 0.01]}, 0.0]}
+    (text,) = warnings_of(**idle, loads=[ramp])
+    assert text.endswith("the body is loaded by loads.0: use `load-displacement`")
+
+
 def test_only_some_of_many_points_are_named() -> None:
     select = {"nearest": [[50.0 + n, 0.0] for n in range(20)]}
     assert len(warnings_of(leaders=[{"select": select, "motion": HOLD}])) == 5

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 import pbdkit
-from pbdkit.sweeps.specification import coordinate
+from pbdkit.model.reading import Source
+from pbdkit.sweeps.specification import checked, coordinate
 
 PLATE = {
     "name": "plate",
@@ -123,6 +124,8 @@ def test_maps_are_drawn_at_rest_without_recorded_positions(swept):
     ("choice", "said"),
     [
         ({"steel": 9}, "steel=9: no member has this value; there are 0.1, 0.2, 0.3"),
+        ({"span": "9 mm"}, "span=9 mm: no member has this value; there are 7, 8 mm"),
+        ({"span": "7 s"}, "span=7 s: '7 s' is not a value in mm; write for instance mm"),
         (
             {"stel": 1},
             "stel: is not a parameter of this sweep; did you mean 'steel'? (",
@@ -135,13 +138,35 @@ def test_invalid_member_selection_is_refused(swept, choice, said):
     assert said in str(caught.value)
 
 
+def test_members_are_selected_by_values_with_units(swept):
+    assert swept.pbd.member(span="0.7 cm").span == 7.0
+    # A parameter in lattice units is converted with the units of the experiment.
+    coarse = swept.assign_coords(span=swept.span.assign_attrs(units="lattice unit"))
+    assert coarse.pbd.member(span="0.8 cm").span == 8.0
+
+
+@pytest.mark.parametrize("section", ["vary", "together"])
+def test_values_with_units_of_one_kind_have_the_unit_of_the_first(section):
+    values = ["7 mm", "1 cm", "0.6 in"]
+    sweep = checked({"experiment": PLATE, section: {"body.width": values}}, Source())
+    experiment = pbdkit.Experiment.build(Source(data=PLATE))
+    found = coordinate("body.width", getattr(sweep, section)["body.width"], experiment, "span")
+    assert (found.values.tolist(), found.attributes["units"]) == ([7.0, 10.0, 15.24], "mm")
+
+
+def test_texts_that_begin_with_numbers_are_no_values_with_units():
+    values = ("2 plates", "3 discs")
+    sweep = checked({"experiment": PLATE, "vary": {"name": [*values]}}, Source())
+    assert sweep.vary["name"] == values
+
+
 def test_commands_select_a_member(swept, call, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     swept.to_netcdf("s.nc")
     refused = call("plot", "s.nc", "--color", "u_x")
     assert refused.code == 2
     assert "--at NAME=VALUE, in Python with" in refused.err
-    assert "steel: 0.1, 0.2, 0.3; span: 7, 8" in refused.err
+    assert "steel: 0.1, 0.2, 0.3; span: 7, 8 mm" in refused.err
     choice = ["--at", "steel=0.2", "--at", "poisson_ratio=0.3", "--at", "span=7"]
     assert call("plot", "s.nc", "--color", "u_x", "--dpi", "50", *choice).code == 0
     assert call("curve", "s.nc", "--y", "u_x", *choice[:2]).code == 0

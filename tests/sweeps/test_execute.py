@@ -21,11 +21,19 @@ import xarray
 from reliability.sweep_under_fire import under_fire
 
 import pbdkit
+from pbdkit.cli.sweep import report_end
 from pbdkit.io import sqlite_file
 from pbdkit.model.reading import Source
+from pbdkit.progress import Stop
 from pbdkit.sweeps import store as stores
-from pbdkit.sweeps.execute import ClusterExecutor, ProcessExecutor, SerialExecutor, carry_out
-from pbdkit.sweeps.specification import SweepPlan, checked, replicate_seeds
+from pbdkit.sweeps.execute import (
+    ClusterExecutor,
+    ProcessExecutor,
+    SerialExecutor,
+    Summary,
+    carry_out,
+)
+from pbdkit.sweeps.specification import Job, Member, SweepPlan, checked, replicate_seeds
 
 VARY = {"solver.relaxation": [0.5, 1.0], "body.columns": [4, 5]}
 
@@ -174,6 +182,17 @@ def test_failures_are_reported_and_stop_no_other_member(call, small):
     assert "0 run now, 3 stored before" in again.out
     assert call("verify", "s/sweep.nc").code == 0
     assert "contains all members of a sweep" in call("plot", "s/sweep.nc").err
+
+
+def test_separated_members_are_printed_apart_from_complete_ones(capsys):
+    keys = ["complete", "separated", "settled"]
+    members = [
+        Member((n,), f"energy={n}", Job(key, "", None, "all", {})) for n, key in enumerate(keys)
+    ]
+    summary = Summary(members, {key: (key, "") for key in keys}, 3, [], Path("s/sweep.nc"))
+    assert report_end(summary, Path("s"), Stop(), quiet=False) == 0
+    told = "2 of 3 members complete, 1 separated (energy=1): s/sweep.nc\n"
+    assert capsys.readouterr().out == told
 
 
 def test_exception_in_a_member_is_attributed_to_it(small, probing):
@@ -438,6 +457,11 @@ WRONG = [
     ({"vary": {"steps": [2, 0]}}, "member steps=0: .*steps: should be greater than or equal to 1"),
     ({"vary": {"steps": []}}, "vary.steps: expected a list of values"),
     ({"vary": {"steps": 5}}, "vary.steps: expected a list of values"),
+    ({"vary": {"body.width": "2 mm"}}, r"vary.body.width: expected .*; write \['2 mm'\]"),
+    ({"vary": {"body.width": ["5 mm", 10]}}, "vary.body.width: 10 has no unit, but other values"),
+    ({"vary": {"body.width": ["5 mm", "0.5 cm"]}}, "vary.body.width: '5 mm' is listed twice"),
+    ({"vary": {"body.width": ["5 mm", "1 kPa"]}}, "vary.body.width: '1 kPa' is not a quantity in "
+     "mm as '5 mm'"),
     ({"vary": {"steps": [2, 2]}}, "vary.steps: 2 is listed twice"),
     ({"vary": {"steps": {"from": 1, "to": 2}}}, "vary.steps.count: is missing"),
     ({"vary": {"body.width": {"from": "6 mm", "to": "14 mm", "count": 3}}},
