@@ -13,6 +13,7 @@ from pbdkit.errors import PluginError
 from pbdkit.hooks import worded
 from pbdkit.plugin import Component, Lattice, NeighbourMetric
 from pbdkit.testing import component_properties, mechanics_properties, step_properties
+from pbdkit.testing.states import DivergenceError
 from pbdkit.testing.subject import (
     NotApplicableError,
     Property,
@@ -142,7 +143,7 @@ def _judged(tested: Property, subject: Subject) -> Outcome:
         tested.check(subject)
     except NotApplicableError as reason:
         return Outcome(tested.name, "skipped", str(reason))
-    except PropertyError as fault:
+    except (PropertyError, DivergenceError) as fault:
         return Outcome(tested.name, "failed", str(fault))
     except Exception as error:
         package = type(subject.component).__module__.split(".")[0]

@@ -1,14 +1,18 @@
 """Laws of mechanics: the deviation of a scene from each law, relative to the largest stiffness.
 
-There are four laws:
+Four laws are tested by the stiffness matrix K = -∂force/∂u of the particles of the body, including
+leaders. It is computed from the forces of the stepper, for small solids with free edges:
 
 - a rigid motion of a body stores no energy;
 - the stiffness is symmetric (Maxwell and Betti);
 - no deformation has a negative energy;
 - a broken bond increases no stiffness.
 
-They are tested by the stiffness matrix K = -∂force/∂u of the particles of the body, including
-leaders. It is computed from the forces of the stepper, for small solids with free edges.
+Two laws connect the forces with what a rule declares:
+
+- forces are the negative derivative of the strain energy;
+- under a strain with a constant gradient, the force on a particle is the divergence of the stress
+  of the declared material, times the area of the particle.
 """
 
 from __future__ import annotations
@@ -30,7 +34,7 @@ from pbdkit.io.checkpoint import Checkpoint
 from pbdkit.io.recorder import Recorder
 from pbdkit.io.sinks import MemorySink
 from pbdkit.model.experiment import Experiment
-from pbdkit.plugin import Component, FollowerRule, FramePolicy, StoresEnergy
+from pbdkit.plugin import Component, FollowerRule, FramePolicy, Stiffness, StoresEnergy
 from pbdkit.plugin.component import as_vector
 from pbdkit.plugin.rule import material_of
 from pbdkit.plugin.vector import vector
@@ -40,7 +44,7 @@ from pbdkit.simulation import Simulation, checkpoint_of, record
 from pbdkit.stepping.followers import SlotFollowers
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import State, initial_state
-from pbdkit.testing.states import displacements, state_with
+from pbdkit.testing.states import displacements, spacing, state_with
 
 SHARE_BROKEN = 0.2
 """Fraction of bonds that are broken at random."""
@@ -49,6 +53,8 @@ NUDGE = 1e-5
 
 The error is of the order of its square.
 """
+DIRECTIONS = 3
+"""Number of displacements for which work and energy are compared."""
 
 
 def whole_state(scene: Scene) -> State:
@@ -165,6 +171,73 @@ def stiffening(K: Floats, K_damaged: Floats) -> float:
     return _share(np.linalg.eigvalsh((increase + increase.T) / 2)[-1], K)
 
 
+def work_and_energy(scene: Scene, share: float) -> Floats:
+    """Return the work of the forces for some small displacements from a deformed state, and the
+    decrease of the strain energy, as two rows.
+
+    Both are relative to the product of the norms of force and displacement. The displacements of
+    the deformed state are at most a fraction `share` of the lattice constant.
+    """
+    followers, state = SlotFollowers(scene), whole_state(scene)
+    place, nudge = scene.raster.place_of(scene.raster.body_rows), NUDGE * spacing(scene)
+
+    def placed(table: Floats) -> Floats:
+        u = np.zeros_like(state.u, dtype=float)
+        flat = u.reshape(len(u), -1)
+        flat[:, place] = table.T
+        if scene.frame:
+            scene.frame.follow(flat, flat)
+        return u
+
+    u = displacements(scene, 10, share)
+    forces = followers.forces(placed(u), state).reshape(2, -1)[:, place].T
+    pairs = []
+    for direction in np.random.default_rng(11).uniform(-1.0, 1.0, (DIRECTIONS, *u.shape)):
+        size = np.linalg.norm(forces) * np.linalg.norm(direction)
+        behind, ahead = (
+            followers.energy(placed(u + sign * nudge * direction), state) for sign in (-1.0, 1.0)
+        )
+        work = float((forces * direction).sum())
+        pairs.append((work / size, (behind - ahead) / (2.0 * nudge * size)))
+    return np.array(pairs).T
+
+
+def force_constants(scene: Scene) -> Floats:
+    """Return the force on the middle particle per area, under displacements with a constant second
+    derivative at rest.
+
+    Returns
+    -------
+    NDArray
+        Array of shape (pair, axis of the displacement, axis of the force), for the second
+        derivatives in xx, in yy and in xy.
+    """
+    followers, state, raster = SlotFollowers(scene), whole_state(scene), scene.raster
+    place, X = raster.place_of(raster.body_rows), raster.reference(raster.body_rows)
+    middle = int(np.abs(X - X.mean(axis=0)).max(axis=1).argmin())
+    x, y = (X - X[middle]).T
+    result = np.empty((3, 2, 2))
+    for pair, field in enumerate((x * x / 2.0, y * y / 2.0, x * y)):
+        size = NUDGE * spacing(scene) / np.abs(field).max()
+        for axis in range(2):
+            u = np.zeros_like(state.u, dtype=float)
+            u.reshape(2, -1)[axis, place] = size * field
+            difference = followers.forces(u, state) - followers.forces(-u, state)
+            result[pair, axis] = difference.reshape(2, -1)[:, place[middle]] / (2.0 * size)
+    cell = scene.experiment.lattice.cell()
+    return result * len(cell.sites) / abs(float(np.linalg.det(np.array(cell.vectors))))
+
+
+def declared_constants(c: Stiffness) -> Floats:
+    """Return the divergence of the stress that a material has under the displacements of
+    `force_constants`."""
+    C = np.array(
+        [[c.xx, c.xy, c.x_shear], [c.xy, c.yy, c.y_shear], [c.x_shear, c.y_shear, c.shear]]
+    )[np.array([[0, 2], [2, 1]])[:, :, None, None], np.array([[0, 2], [2, 1]])]
+    second = np.array([[[1.0, 0.0], [0.0, 0.0]], [[0.0, 0.0], [0.0, 1.0]], [[0.0, 1.0], [1.0, 0.0]]])
+    return np.asarray(np.einsum("ijkl,pjl->pki", C, second))
+
+
 def _share(value: float, K: Floats) -> float:
     largest = np.abs(K).max()
     return max(0.0, float(value)) / float(largest) if largest > 0.0 else 0.0
@@ -190,6 +263,8 @@ def resumed(scene: Scene, rebuilt: Scene, step: int, start: State | None = None)
 
 BODY = {"type": "grid", "columns": 4, "rows": 4}
 """Body of the solids."""
+LARGER_BODY = {"type": "grid", "columns": 9, "rows": 9}
+"""Body in which a particle is far from the edges."""
 TEARS = {"type": "strain", "failure": 0.1}
 """Fracture model of the solids."""
 SPRINGS = {"type": "springs"}
@@ -226,6 +301,13 @@ class Solid:
     def torn(self) -> Floats:
         """Stiffness with further bonds broken."""
         return stiffness(self.scene, torn_state(self.scene, 4, self._softened))
+
+    @cached_property
+    def larger(self) -> Scene:
+        """The scene with a larger body, in which the middle particle is far from the edges."""
+        experiment = self.scene.experiment
+        body = type(experiment.body).model_validate(LARGER_BODY)
+        return build_scene(experiment.model_copy(update={"body": body}))
 
     @property
     def stages(self) -> list[tuple[str, Floats]]:

@@ -34,9 +34,12 @@ from pbdkit.testing.mechanics import (
     NoSolidError,
     Solid,
     asymmetry,
+    declared_constants,
     energy_given_back,
+    force_constants,
     resistance_to_rigid_motions,
     stiffening,
+    work_and_energy,
 )
 from pbdkit.testing.states import advanced, displacements
 from pbdkit.testing.subject import NotApplicableError, PropertyError, Subject, place_of, property_of
@@ -145,8 +148,11 @@ def goes_alike_mirrored_and_turned(subject: Subject) -> None:
         raise NotApplicableError("it declares `has_axes`, and depends on directions")
     scenes = [scene for each in subject.scenes if (scene := _even_scene(each.experiment))][:2]
     if not scenes:
+        if all(scene.experiment.lattice.type != "square" for scene in subject.scenes):
+            raise NotApplicableError("no scene on the square lattice accepts the component")
         raise NotApplicableError(
-            "every scene has random numbers, state variables, or preferred directions"
+            "every scene on the square lattice has random numbers, state variables, preferred "
+            "directions, or neighbours that are not symmetric"
         )
     for scene in scenes:
         u = displacements(scene, 9, share=0.5)
@@ -272,6 +278,75 @@ def does_not_stiffen_by_breaking(subject: Subject) -> None:
                     ),
                     "scale the difference of a bond by a factor that decreases from 1 to 0",
                 )
+
+
+AGREE = 1e-6
+"""Relative tolerance for forces, energy and stiffness, of which differences are computed."""
+SHARES = (0.01, 0.2)
+"""Largest displacements at which work and energy are compared, relative to the lattice constant."""
+
+
+@property_of(FollowerRule)
+def stores_the_work_of_its_forces(subject: Subject) -> None:
+    """If forces are defined, they are the negative derivative of the strain energy of the body, for
+    small and for finite displacements."""
+    for solid in _solids(subject):
+        for share in SHARES:
+            work, decrease = work_and_energy(solid.scene, share)
+            if fault := _disagreement(decrease, work):
+                remedy = (
+                    "`energy` is half of the energy of a bond, because it is evaluated at both "
+                    "ends, and `force` is its negative derivative"
+                    if isinstance(subject.component, StoresEnergy)
+                    else "derive a nonlinear rule from `StoresEnergy`, and define `energy`"
+                )
+                extent = f"under displacements of {share:g} lattice constants"
+                _fail(
+                    solid.scene,
+                    f"the decrease of the energy {fault} the work of the forces {extent}",
+                    remedy,
+                )
+
+
+@property_of(FollowerRule)
+def is_as_stiff_as_declared(subject: Subject) -> None:
+    """If forces are defined, those under small strains in the interior of a body are the forces of
+    the material that `elasticity` declares."""
+    solids, rule = _solids(subject), subject.component
+    if rule.uses_reference:
+        raise NotApplicableError("its forces depend on positions")
+    solids = [solid for solid in solids if _sites_are_equivalent(solid.scene)]
+    if not solids:
+        raise NotApplicableError("the sites of each lattice have different neighbours")
+    expected = declared_constants(rule.elasticity())
+    for solid in solids:
+        constants = force_constants(solid.larger)
+        if fault := _disagreement(constants, expected):
+            _fail(
+                solid.scene,
+                f"the stiffness of the forces {fault} that of `elasticity`",
+                "both are divided by Young's modulus and thickness; a particle exerts the forces "
+                "of the area of one site",
+            )
+
+
+def _sites_are_equivalent(scene: Scene) -> bool:
+    """Return whether all sites of the lattice have neighbours in the same directions. Otherwise
+    sublattices move relative to each other under a strain."""
+    rests = [np.array(sorted(slot.rest for slot in slots)) for slots in scene.neighbourhood.slots]
+    return all(r.shape == rests[0].shape and np.allclose(r, rests[0]) for r in rests)
+
+
+def _disagreement(values: Floats, expected: Floats) -> str:
+    """Return how two sets of values differ, for messages; empty if they agree."""
+    difference = np.abs(values - expected).max()
+    if difference <= AGREE * np.abs(expected).max():
+        return ""
+    factor = float((values * expected).sum() / max(1e-300, float((expected * expected).sum())))
+    if np.abs(values - factor * expected).max() <= AGREE * np.abs(expected).max():
+        return f"is {factor:.6g} times"
+    share = difference / max(1e-300, float(np.abs(expected).max()))
+    return f"differs by {share:.3g} of the largest value from"
 
 
 def _solids(subject: Subject) -> list[Solid]:

@@ -69,13 +69,45 @@ def state_with(scene: Scene, u: Any) -> State:
     return state
 
 
+class DivergenceError(Exception):
+    """The steps of a scene diverge with the component that is tested.
+
+    Parameters
+    ----------
+    scene : Scene
+        Scene.
+    step : int
+        Step in which the displacements are not finite or too large.
+    """
+
+    def __init__(self, scene: Scene, step: int) -> None:
+        experiment = scene.experiment
+        super().__init__(
+            f"a run from random displacements diverges at step {step} with the rule "
+            f"'{experiment.rule.type}' on the {experiment.lattice.type} lattice; scale the move "
+            "that `apply` returns, so that steps with relaxation 1 are stable: divide the force "
+            "by the largest stiffness of the bonds at their strain"
+        )
+
+
 def advanced(scene: Scene, u: Any, steps: int) -> Floats:
-    """Return the displacements of the body in the steps that follow u, (step, particle, axis)."""
+    """Return the displacements of the body in the steps that follow u, (step, particle, axis).
+
+    Raises
+    ------
+    DivergenceError
+        If a displacement is not finite.
+    """
     stepper, raster = Stepper(scene), scene.raster
     states = accumulate(
         range(steps), lambda state, _: stepper.advance(state), initial=state_with(scene, u)
     )
-    return np.array([raster.table(state.u)[raster.body_rows] for state in states])
+    with np.errstate(all="ignore"):
+        u_of_steps = np.array([raster.table(state.u)[raster.body_rows] for state in states])
+    is_finite = np.isfinite(u_of_steps).all(axis=(1, 2))
+    if not is_finite.all():
+        raise DivergenceError(scene, int(np.argmin(is_finite)))
+    return u_of_steps
 
 
 SHAPE = (4, 3)

@@ -35,6 +35,7 @@ from pbdkit.stepping.state import State, initial_state
 from pbdkit.testing.component_properties import differing
 from pbdkit.testing.mechanics import resumed
 from pbdkit.testing.states import (
+    DivergenceError,
     advanced,
     differences,
     displacements,
@@ -253,10 +254,12 @@ def continues_where_it_stopped(subject: Subject) -> None:
 
 def _refuse_other_records(scene: Scene, rebuilt: Scene) -> None:
     """Raise PropertyError if a run that is stopped, stored and resumed in a rebuilt scene has other
-    records than an uninterrupted one.
+    records than an uninterrupted one, and DivergenceError if that one diverges.
     """
     whole, start = MemorySink(), state_with(scene, displacements(scene, 5, share=0.4))
-    record(Simulation.of_scene(scene, start=start.copy()), whole)
+    outcome = record(Simulation.of_scene(scene, start=start.copy()), whole).outcome
+    if outcome.status == "diverged":
+        raise DivergenceError(scene, outcome.steps)
     datasets = resumed(scene, rebuilt, STEPS - 1, start), whole.dataset()
     records, expected = ({str(n): v for n, v in ds.variables.items()} for ds in datasets)
     for name in differing(expected, records):

@@ -12,6 +12,7 @@ import pbdkit
 from pbdkit.plugin import (
     Loadable,
     Stiffness,
+    StoresEnergy,
     Vector,
     length,
     squared_length,
@@ -250,7 +251,12 @@ class Net(Loadable, Sound):
     type: Literal["net"] = "net"
 
     def elasticity(self):
-        return Stiffness(1.0, 1.0, 0.0, 0.5)
+        return Stiffness(9 / 8, 9 / 8, 3 / 8, 3 / 8)
+
+    def parameters(self, setting):
+        if setting.cells.regular != 3:
+            raise pbdkit.ExperimentError("requires the 6 neighbours of the hexagonal lattice")
+        return super().parameters(setting)
 
     @staticmethod
     def gather(d, r, w, p):
@@ -258,11 +264,15 @@ class Net(Loadable, Sound):
 
     @staticmethod
     def force(total, here, p):
-        return total[0]
+        return SPRING * total[0]
 
     @staticmethod
     def loaded(total, load, p):
-        return total[0] + load, total[1]
+        return total[0] + load / SPRING, total[1]
+
+
+SPRING = 0.75**0.5
+"""Stiffness of the springs, for which Young's modulus of the net is 1."""
 
 
 def pull_along(d, r):
@@ -299,6 +309,37 @@ class PullsOneWay(Net):
     @staticmethod
     def gather(d, r, w, p):
         return (2.0 if r.x > 0.0 else 1.0) * pull_along(d, r), 1.0
+
+
+class StoresTwice(StoresEnergy, Net):
+    """The energy of a bond at both of its ends."""
+
+    type: Literal["stores-twice"] = "stores-twice"
+
+    @staticmethod
+    def energy(d, r, w, p):
+        pull = pull_along(d, r)
+        return SPRING * (pull.x * d.x + pull.y * d.y) / 2.0
+
+
+class Overstates(Net):
+    """Declares twice the stiffness of its springs."""
+
+    type: Literal["overstates"] = "overstates"
+
+    def elasticity(self):
+        return Stiffness(9 / 4, 9 / 4, 3 / 4, 3 / 4)
+
+
+class Overshoots(Sound):
+    """Moves by the cube of the mean displacement, which is stable for small displacements only."""
+
+    type: Literal["overshoots"] = "overshoots"
+
+    @staticmethod
+    def apply(total, here, p):
+        mean = total[0] / total[1]
+        return (1.0 + 1e4 * squared_length(mean)) * mean
 
 
 class Gives(Net):

@@ -94,6 +94,8 @@ FAULTS = [
     ),
     (rules.PullsOneWay, "acts-both-ways-alike", "use the same weight at both ends of a bond"),
     (rules.Gives, "gives-no-energy-back", "let `force` act towards the neighbours"),
+    (rules.StoresTwice, "stores-the-work-of-its-forces", "energy is 2 times the work of the fo"),
+    (rules.Overstates, "is-as-stiff-as-declared", "is 0.5 times that of `elasticity`"),
     (remembering.Hardens, "does-not-stiffen-by-breaking", "scale the difference of a bond"),
     (rules.Unlike, "is-the-same-compiled", "the compiled engine computes another `u`"),
     (rules.Restarts, "continues-where-it-stopped", "a run continued at step"),
@@ -217,6 +219,18 @@ def test_every_fault_is_detected_and_named(faulty, name, words):
     report = examine(made(faulty), **ONE_SITE_AND_TWO, **NEAREST)
     assert [outcome.property for outcome in report.failed] == [name], str(report)
     assert words in report.failed[0].reason
+
+
+def test_divergence_with_a_component_is_reported_as_such():
+    report = examine(rules.Overshoots(), **ONE_SITE_AND_TWO, **NEAREST)
+    (failed,) = report.failed
+    assert re.match(r"a run from random displacements diverges at step \d with the", failed.reason)
+    assert "scale the move that `apply` returns, so that steps with relaxation 1 are" in failed.reason
+
+
+def test_reason_for_no_reflection_names_the_lattice_that_a_component_refuses():
+    report = examine(rules.Net(), **ONE_SITE_AND_TWO, **NEAREST)
+    assert "no scene on the square lattice accepts the component" in report.summary()
 
 
 def test_every_property_detects_a_fault():
@@ -359,7 +373,7 @@ def test_one_line_suffices_for_pytest(tmp_path):
         assert summary in done.stdout
     assert "does not declare `linear`" in done.stdout
     assert "FollowerRule bad: rests: a body at rest moves by 1e-09" in done.stdout
-    assert re.search(r"^1 failed, 41 passed, 20 skipped", done.stdout, re.MULTILINE), done.stdout
+    assert re.search(r"^1 failed, 41 passed, 24 skipped", done.stdout, re.MULTILINE), done.stdout
 
 
 def test_plugins_check_tests_a_distribution(install, call):
