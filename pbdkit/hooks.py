@@ -114,6 +114,8 @@ NO_REFERENCE = (
 SLIPS: tuple[tuple[type[Exception], str, str], ...] = (
     (IndexError, "tuple index out of range",
      "`total` contains the sums of the values that `gather` and `gather_pair` return"),
+    (ValueError, "could not be broadcast",
+     "compute one value for each particle, element by element from the arguments"),
     (TypeError, "can be converted to Python scalars",
      "use functions of numpy, as `numpy.sqrt`, in place of those of `math`"),
     (TypeError, "'numpy.ndarray' object is not callable",

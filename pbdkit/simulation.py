@@ -257,43 +257,59 @@ class SteppingDriver(Driver):
 
     def _diverged(self, error: FloatingPointError) -> States:
         step, rule = self.state.step, self.scene.experiment.rule.type
-        cause = self._cause_of_nan()
-        if self.rejection and not cause and np.isfinite(self.state.u).all():
-            cause = ": displacements are finite, but a recorded variable is not"
-        reason = f"{error} diverged under rule '{rule}'{cause}"
-        self.rejection = None
+        largest, good = self.guard.largest_displacement(self.state), None
         if self.recorded_step < step - 1:
             good = self.guard.last_good(
                 self.scene, self._engine, step, self._steps_per_call, self.watch.stopping
             )
-            if good is not None and good.step > self.recorded_step:
-                self.ends_early = True
-                yield good
-                if not self.rejection:  # Otherwise a diagnostic is not finite.
-                    reason += (
-                        f"; the last recorded state is step {good.step}, the last in which no "
-                        "displacement exceeds the size of the body and the paths of its leaders"
-                    )
+        if self.rejection and np.isfinite(largest):
+            cause = "displacements are finite, but a recorded variable is not"
+        elif np.isnan(largest) and self._was_bounded(good):
+            cause = self._cause_of_nan(good)
+        else:
+            cause = UNSTABLE
+        reason = f"{error} diverged under rule '{rule}': {cause}"
+        self.rejection = None
+        if good is not None and good.step > self.recorded_step:
+            self.ends_early = True
+            yield good
+            if not self.rejection:  # Otherwise a diagnostic is not finite.
+                reason += (
+                    f"; the last recorded state is step {good.step}, the last in which no "
+                    "displacement exceeds the size of the body and the paths of its leaders"
+                )
         return RunOutcome("diverged", reason, step)
 
-    def _cause_of_nan(self) -> str:
-        """Return the place in the rule at which NaN appears; an empty string if there is no NaN.
+    def _was_bounded(self, good: State | None) -> bool:
+        """Return whether the state before the first NaN was good, so that NaN is not the result of
+        growing displacements. `good` is the last good state, or None if the state before the last
+        step was recorded."""
+        if good is None:
+            return self.guard.good_step >= self.state.step - 1
+        following = self._engine.advance(good.copy(), 1)
+        return bool(np.isnan(self.guard.largest_displacement(following)))
+
+    def _cause_of_nan(self, good: State | None) -> str:
+        """Return the place in the rule at which NaN appears, and the remedy.
 
         It is located by repeating the last steps with numpy.
         """
-        if not np.isnan(self.state.u).any():
-            return ""
-        rule, start = type(self.scene.experiment.rule), self.guard.good_copy
-        start = start.copy() if start else initial_state(self.scene)
+        rule, copy = type(self.scene.experiment.rule), self.guard.good_copy
+        start = (good or copy or initial_state(self.scene)).copy()
         steps, place = self.state.step - start.step, ""
         try:
-            if steps <= EVERY:
-                Stepper(self.scene, strict=True).advance(start, steps)
+            if good is not None or steps <= EVERY:
+                Stepper(self.scene, strict=True).advance(start, 1 if good is not None else steps)
         except FloatingPointError as error:
             place = f", from {worded(error, rule.__module__.split('.')[0])}"
-        return (
-            f": a displacement is NaN{place}; guard divisions and roots with `pbdkit.plugin.where`"
-        )
+        return f"a displacement is NaN{place}; guard divisions and roots with `pbdkit.plugin.where`"
+
+
+UNSTABLE = (
+    "the steps became unstable; lower solver.relaxation, or use solver: {type: equilibrium}, which "
+    "computes the equilibria that the steps approach"
+)
+"""Cause and remedy of a divergence by growing displacements."""
 
 
 class EquilibriumDriver(Driver):

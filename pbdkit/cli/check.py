@@ -20,6 +20,8 @@ from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.simulation import rehearse
 from pbdkit.stability.forecast import Forecast, forecast, refuse_unheld_loads
 from pbdkit.stability.relaxation import tuned
+from pbdkit.stepping.function_checks import check_functions
+from pbdkit.stepping.state import initial_state
 
 Row = tuple[str, str]
 MAX_LISTED = 3
@@ -42,7 +44,9 @@ def check(
         object (`as_json`).
     """
     with waiting(f"checking {experiment.name}", silent=as_json):
-        scene = tuned(build_scene(experiment))
+        built = build_scene(experiment)
+        check_functions(built, initial_state(built))
+        scene = tuned(built)
         rehearse(scene)
         refuse_unheld_loads(scene)
         predicted = forecast(scene)

@@ -234,7 +234,9 @@ def declared_constants(c: Stiffness) -> Floats:
     C = np.array(
         [[c.xx, c.xy, c.x_shear], [c.xy, c.yy, c.y_shear], [c.x_shear, c.y_shear, c.shear]]
     )[np.array([[0, 2], [2, 1]])[:, :, None, None], np.array([[0, 2], [2, 1]])]
-    second = np.array([[[1.0, 0.0], [0.0, 0.0]], [[0.0, 0.0], [0.0, 1.0]], [[0.0, 1.0], [1.0, 0.0]]])
+    second = np.array(
+        [[[1.0, 0.0], [0.0, 0.0]], [[0.0, 0.0], [0.0, 1.0]], [[0.0, 1.0], [1.0, 0.0]]]
+    )
     return np.asarray(np.einsum("ijkl,pjl->pki", C, second))
 
 

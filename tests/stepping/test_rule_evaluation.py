@@ -83,6 +83,47 @@ class HasWeights(Plain):
         return d * w.nearnes, 1.0
 
 
+class MovesAllButOne(Plain):
+    type: Literal["moves-all-but-one"] = "moves-all-but-one"
+
+    @staticmethod
+    def apply(total, here, p):
+        return pbdkit.plugin.Vector(total[0].x[:-1], total[0].y[:-1])
+
+
+class GathersAllButOne(Plain):
+    type: Literal["gathers-all-but-one"] = "gathers-all-but-one"
+
+    @staticmethod
+    def gather(d, r, w, p):
+        return pbdkit.plugin.Vector(d.x[:-1], d.y[:-1]), 1.0
+
+
+class GathersList(Plain):
+    type: Literal["gathers-list"] = "gathers-list"
+
+    @staticmethod
+    def gather(d, r, w, p):
+        return d, [1.0]
+
+
+class AddsOtherShapes(Plain):
+    type: Literal["adds-other-shapes"] = "adds-other-shapes"
+
+    @staticmethod
+    def apply(total, here, p):
+        return pbdkit.plugin.Vector(total[0].x[:-1] + total[0].x, total[0].y)
+
+
+class GrowsByCubes(Plain):
+    type: Literal["grows-by-cubes"] = "grows-by-cubes"
+
+    @staticmethod
+    def apply(total, here, p):
+        mean = total[0] / total[1]
+        return (1.0 + 1e3 * pbdkit.plugin.squared_length(mean)) * mean
+
+
 class StartsAtVector(pbdkit.plugin.RenewsParticles, Plain):
     type: Literal["starts-at-vector"] = "starts-at-vector"
 
@@ -143,6 +184,13 @@ MISTAKES = {
     HasTable: ("`p` contains numbers, and the param", NO_NUMBER, "evaluation.py, line "),
     HasMode: ("`p` contains numbers, and the parameter 'mode'", NO_NUMBER, "evaluation.py, line "),
     HasWeights: ("did you mean 'nearness'?", "evaluation.py, line "),
+    MovesAllButOne: ("'moves-all-but-one' failed at the beginning of the run: `apply` returned the",
+                     "shape (99,) for 100 particles", "element by element", "evaluation.py, line "),
+    GathersAllButOne: ("`gather` at the neighbour with the site offset (-1, 0) returned the shape",
+                       "value 1 of 2; return numbers and vectors", "evaluation.py, line "),
+    GathersList: ("returned list as value 2 of 2; return numbers", "evaluation.py, line "),
+    AddsOtherShapes: ("failed at the beginning of the run in `apply`: ValueError: operands could",
+                      "; compute one value for each particle", "evaluation.py, line "),
     StartsAtVector: ("the initial value of 'way' is Vector", "not a number", "as way_x and way_y"),
     Array: ("Diagnostic 'array' failed at step 0: `measure` returned ndarray", TUPLE),
     Alone: ("Diagnostic 'alone' failed", "`variables` returned Variable", TUPLE),
@@ -159,3 +207,14 @@ def test_error_in_a_run_names_place_cause_and_remedy(part):
         pbdkit.run("paper/a", components=[part], settings=settings | {"steps": 3}, progress=False)
     said = str(caught.value)
     assert [words for words in MISTAKES[part] if words not in said] == [], said
+
+
+@pytest.mark.parametrize("every", [1, 1000])
+def test_nan_after_growing_displacements_is_an_instability(every):
+    settings = {"rule": {"type": "grows-by-cubes"}, "steps": 1000, "record.every": every}
+    with pytest.raises(pbdkit.DivergedError) as caught:
+        pbdkit.run("paper/a", components=[GrowsByCubes], settings=settings, progress=False)
+    assert "the steps became unstable; lower solver.relaxation, or use solver: {typ" in str(
+        caught.value
+    )
+    assert "NaN" not in str(caught.value)

@@ -225,7 +225,9 @@ def test_divergence_with_a_component_is_reported_as_such():
     report = examine(rules.Overshoots(), **ONE_SITE_AND_TWO, **NEAREST)
     (failed,) = report.failed
     assert re.match(r"a run from random displacements diverges at step \d with the", failed.reason)
-    assert "scale the move that `apply` returns, so that steps with relaxation 1 are" in failed.reason
+    assert (
+        "scale the move that `apply` returns, so that steps with relaxation 1 are" in failed.reason
+    )
 
 
 def test_reason_for_no_reflection_names_the_lattice_that_a_component_refuses():
