@@ -285,7 +285,7 @@ NOT_BY_PLACE = [np.max, np.size, lambda x: x / np.max(x), lambda x: x - np.mean(
 
 @pytest.mark.parametrize("function", [*ALIKE, *NOT_BY_PLACE])
 def test_constants_of_varying_parameters_are_those_of_each_place_alone(function):
-    """Whether or not a function of parameters supports arrays."""
+    """Functions of parameters need not support arrays."""
     limits = np.array([3.0, 1.0, 2.0, 2.0, 5.0, 4.0])
     found = evaluate(Scaled(), {"limit": limits}, lambda part: {"k": function(part.limit)})["k"]
     np.testing.assert_array_equal(found, [function(limit) for limit in limits.tolist()])
