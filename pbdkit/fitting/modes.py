@@ -48,6 +48,9 @@ def solve(problem: Problem, start: Floats, loss: Loss) -> tuple[Problem, Solutio
     UnconvergedError
         If the iteration does not converge.
     """
+    if loss == "cauchy":
+        # The cost has several minima; that of a convex loss is near the lowest one.
+        start = solved(problem, start, "soft_l1").z
     solution = solved(problem, start, loss)
     for _ in range(MAX_CHOICES):
         changed, start = choose_modes(problem, solution.z, loss)
