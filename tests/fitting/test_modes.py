@@ -49,9 +49,9 @@ def test_each_group_can_have_its_number(fit_with):
         fit_with(1e-6, [5])
 
 
-@pytest.mark.parametrize("number", [9, 17])
+@pytest.mark.parametrize("number", [9, 43, 51])
 def test_a_sample_of_the_long_trial(number, monkeypatch):
-    """Few and noisy points with patches; bounds that are not valid together."""
+    """Few and noisy points with patches, short edges, bounds that are not valid together."""
     monkeypatch.syspath_prepend(Path(__file__).parents[1] / "reliability")
     import fit_convergence
 
