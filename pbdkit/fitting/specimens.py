@@ -37,6 +37,11 @@ TAIL = 0.025
 """Probability on each side of a 95 % interval."""
 MAX_DEVIATION = 10.0
 """Largest standard deviation between specimens, divided by that of the estimates."""
+COLUMNS = (
+    "mean", "standard_error", "low", "high", "degrees_of_freedom", "deviation", "deviation_low",
+    "deviation_high",
+)  # fmt: skip
+"""Variables of the dataset of estimates that are numbers for each parameter."""
 MAX_DOUBLINGS = 60
 """Maximum number of doublings of the upper end of the interval of a standard deviation."""
 
@@ -258,9 +263,11 @@ class FittedSpecimens:
     def estimates(self) -> xarray.Dataset:
         """Dataset of all estimates.
 
-        The variables `value` and `error` have the dimensions specimen and parameter, and `mean`,
-        `standard_error`, `low`, `high` and `deviation` the dimension parameter. Numbers that are
-        not identifiable are NaN. `unit` is a coordinate of the parameters.
+        The variables `value` and `error` have the dimensions specimen and parameter. All others
+        have the dimension parameter: `mean`, `standard_error` and its interval from `low` to
+        `high`, with the `degrees_of_freedom` of Student's t, and `deviation` between specimens with
+        its interval from `deviation_low` to `deviation_high`. Numbers that are not identifiable are
+        NaN. `unit` is a coordinate of the parameters.
         """
         import xarray
 
@@ -273,14 +280,20 @@ class FittedSpecimens:
                     table[:, i, j] = estimate.value, estimate.error
         columns = np.array(
             [
-                (mean.value, mean.error, *mean.interval, mean.deviation)
+                (
+                    mean.value,
+                    mean.error,
+                    *mean.interval,
+                    mean.degrees_of_freedom,
+                    mean.deviation,
+                    *mean.deviation_interval,
+                )
                 if mean.identifiable
-                else (np.nan,) * 5
+                else (np.nan,) * len(COLUMNS)
                 for mean in self.means.values()
             ]
         )
-        words = ("mean", "standard_error", "low", "high", "deviation")
-        by_parameter = {word: ("parameter", columns[:, n]) for n, word in enumerate(words)}
+        by_parameter = {word: ("parameter", columns[:, n]) for n, word in enumerate(COLUMNS)}
         both = ("specimen", "parameter")
         return xarray.Dataset(
             {"value": (both, table[0]), "error": (both, table[1]), **by_parameter},

@@ -141,6 +141,8 @@ def test_summary_json_and_dataset_have_the_mean_and_the_scatter(fitted):
     chosen = table.sel(parameter=RATIO)
     assert float(chosen["mean"]) == mean.value
     assert float(chosen.deviation) == mean.deviation
+    assert (float(chosen.low), float(chosen.deviation_high)) == (low, mean.deviation_interval[1])
+    assert float(chosen.degrees_of_freedom) == 2.0
     assert float(chosen.value.sel(specimen="c")) == fitted.estimate("c", RATIO).value
 
 
