@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +22,7 @@ from pbdkit.fitting.observations import (
     TracksObservation,
 )
 from pbdkit.fitting.problem import MODULUS, Loss, Problem, Solution, spread_of
+from pbdkit.fitting.residual_pattern import remedy_of_excess
 from pbdkit.fitting.uncertainty import (
     Candidate,
     Combination,
@@ -144,6 +145,8 @@ class Misfit:
         If the experiment has units, `factor` times the noise is its value in `unit`.
     correlation
         Correlation of the residuals; None if it is not significant.
+    remedy
+        Description of residuals well above the noise, and a remedy; otherwise empty.
     """
 
     kind: str
@@ -155,6 +158,7 @@ class Misfit:
     factor: float = 1.0
     unit: str = ""
     correlation: ResidualCorrelation | None = None
+    remedy: str = ""
 
     @property
     def noise_with_unit(self) -> str:
@@ -555,10 +559,8 @@ def _excess_text(misfit: Misfit, n: int, several: bool) -> str:
     place = f"measured.{n}" if several else "measured"
     return (
         f"{place}: the residuals of the {misfit.kind} are {misfit.ratio:.1f} times the noise of "
-        f"{misfit.noise_with_unit}: the noise is larger than stated, or the experiment does not "
-        "describe the measurement. Standard errors are multiplied by the ratio of all residuals, "
-        "but do not contain the bias of a wrong experiment. Correct `noise`, add terms of "
-        "`distortion` or `modes`, use a smaller lattice constant, or compare `candidates`"
+        f"{misfit.noise_with_unit}: {misfit.remedy}. Standard errors are multiplied by the ratio "
+        "of all residuals, but do not contain the bias of a wrong experiment"
         + "; if the measurements are of several specimens, set `specimens: true`"
         * several
     )
@@ -589,7 +591,7 @@ def _residuals_of(
     observation: Observation, residuals: Floats, loss: Loss, correlation: Correlation | None
 ) -> Misfit:
     """Summarise the residuals of an observation."""
-    return Misfit(
+    misfit = Misfit(
         observation.kind,
         observation.noise * observation.unit,
         spread_of(residuals, 0, loss),
@@ -599,6 +601,10 @@ def _residuals_of(
         *unit_of(observation),
         _correlation_of(observation, correlation),
     )
+    if not misfit.exceeds_noise:
+        return misfit
+    unweighted = replace(observation, weight=1.0)  # As are the residuals here.
+    return replace(misfit, remedy=remedy_of_excess(unweighted, residuals, loss))
 
 
 def unit_of(observation: Observation) -> tuple[float, str]:

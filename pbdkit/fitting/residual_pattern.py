@@ -51,12 +51,27 @@ def remedy_of(observations: Sequence[Observation], residuals: Sequence[Floats], 
     n = int(np.argmax(squares))
     observation, values = observations[n], residuals[n]
     name = f"measurement {n}: " if len(observations) > 1 else ""
+    return name + (_small(values) or remedy_of_excess(observation, values, loss))
+
+
+def remedy_of_excess(observation: Observation, values: Floats, loss: str) -> str:
+    """Describe the residuals of a measurement that exceed its noise, and name a remedy.
+
+    Parameters
+    ----------
+    observation
+        The measurement.
+    values
+        Its residuals, divided by the noise.
+    loss
+        Loss of the fit.
+    """
     places = np.tile(observation.places(), (len(values) // len(observation.rows), 1))
-    text = _small(values)
-    if not text and isinstance(observation, FieldObservation):
+    text = ""
+    if isinstance(observation, FieldObservation):
         text = _distortion(observation, values) or _boundary(observation, values)
     text = text or _block(values, places) or _outliers(values, places, loss)
-    return name + (text or _noise(observation, values))
+    return text or _noise(observation, values)
 
 
 def _at(place: Floats) -> str:

@@ -333,7 +333,7 @@ def test_residuals_well_above_the_noise_are_reported(stated, warned, tmp_path):
     for each in issued:
         assert re.match(
             r"measured: the residuals of the field are [34]\.\d times the noise of 0\.0001: .*"
-            "Correct `noise`, add terms",
+            "use another model, or `noise: 0.0004`",
             str(each.message),
         )
 
