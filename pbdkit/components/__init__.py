@@ -21,6 +21,7 @@ COMPONENTS = {
     "diagnostics": "PE1 PE1Intact PE2 Displacement Track BrokenBonds SmallestCellArea CrackPath "
     "Strain LocalRotation Stress StrainEnergy Reaction LoadDisplacement StressStrain "
     "ContactForces",
+    "gauges": "Extensometer StrainGauge",
     "stress_intensity": "StressIntensity",
 }
 """Names of the component classes, by the module of this package that defines them."""

@@ -568,6 +568,9 @@ class Cohesive(UsesStiffness, SoftensCells, Parting):
     1 in all cells beside it. Cracks do not close under compression.
     """
 
+    other_names: ClassVar[Mapping[str, str]] = {"strength": "onset"}
+    """Other names of parameters."""
+
     type: Literal["cohesive"] = "cohesive"
     placement: Annotated[float, Field(ge=1.0, le=1.0)] = Field(
         1.0, description="Always 1: broken bonds of a material exert no force."
@@ -607,7 +610,7 @@ class Cohesive(UsesStiffness, SoftensCells, Parting):
                 )
             if text:
                 raise PydanticCustomError("fault", "{text}", {"text": text, "key": "strength"})
-            data = {"onset" if key == "strength" else key: value for key, value in data.items()}
+            data = {cls.other_names.get(key, key): value for key, value in data.items()}
         return handler(data)
 
     @classmethod

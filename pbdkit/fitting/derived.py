@@ -193,7 +193,8 @@ def _quantities(
     result = {}
     for n, unknown in enumerate(problem.unknowns):
         row = np.eye(problem.size)[n]
-        result[unknown.parameter.path] = Quantity(np.asarray(solution.z[n]), row, np.zeros(()))
+        value = np.asarray(solution.z[n])
+        result[unknown.parameter.path] = Quantity(value, row, np.zeros(()), unknown.unit)
     if YOUNG in names:
         result[YOUNG] = _modulus(force, problem, solution)
     if names <= {*result}:
@@ -322,11 +323,12 @@ class Response:
         for n, (unknown, du) in enumerate(
             zip(problem.unknowns, self.prediction.changes, strict=True)
         ):
-            yield along(du, float(errors[n])) + unknown.parameter.derivative(
+            of_number = along(du, float(errors[n]) * unknown.scale) + unknown.parameter.derivative(
                 scene.experiment,
                 lambda experiment: self._at(function, scene_like(scene, experiment), u),
                 DERIVATIVES,
             )
+            yield unknown.scale * of_number
         _, own = next(problem.own_slices())
         for n in range(len(problem.unknowns), problem.size):
             is_boundary = 0 <= n - own.start < len(self.prediction.answers)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -16,15 +16,17 @@ from pbdkit.equilibrium.system import one_thread
 from pbdkit.errors import ExperimentError
 from pbdkit.fitting.crack_tip import locate_tip
 from pbdkit.fitting.derived import derive, refuse_other_names
-from pbdkit.fitting.fit_file import Fit
+from pbdkit.fitting.fit_file import AnyBounds, Fit
 from pbdkit.fitting.fit_result import Fitted, fitted
 from pbdkit.fitting.modes import least_size, solve
 from pbdkit.fitting.observations import FieldObservation, Observation
-from pbdkit.fitting.parameter import Parameter
 from pbdkit.fitting.problem import (
+    Loss,
     Problem,
     Solution,
     Unknown,
+    hat_diagonal,
+    spread_of,
     with_correlated_errors,
 )
 from pbdkit.fitting.specimens import FittedSpecimens, combine_specimens
@@ -54,6 +56,17 @@ TINY = 1e-6
 It is used before the noise is estimated from the residuals. Residuals smaller than this fraction of
 the values are rounding errors.
 """
+
+COARSE = 1e-2
+"""The same for several measurements. The noise of others may be known, and the first fit must not
+follow one of them alone."""
+MAX_NOISE_ITERATIONS = 30
+"""Maximum number of fits by which the noise of several measurements is estimated."""
+NOISE_RTOL = 0.01
+"""Relative change of the noise at which the estimate has converged."""
+MIN_REDUNDANCY = 1.0
+"""Smallest number of values, minus that of the unknowns which they determine, for an estimate of
+their noise."""
 
 
 def fit_experiment(
@@ -186,7 +199,7 @@ def _compare_candidates(
 def problem_of(
     fit: Fit,
     experiment: Experiment,
-    unknown_bounds: Mapping[str, tuple[float, float]] | None = None,
+    unknown_bounds: Mapping[str, AnyBounds] | None = None,
     components: ComponentClasses = (),
 ) -> Problem:
     """Return the least-squares problem of a fit file.
@@ -202,9 +215,8 @@ def problem_of(
         If the experiment has no such parameters, or cannot predict the measurements.
     """
     pairs = (fit.unknown if unknown_bounds is None else unknown_bounds).items()
-    unknowns = tuple(Unknown(Parameter(path), *bounds) for path, bounds in pairs)
+    unknowns = tuple(_unknown(path, bounds, experiment) for path, bounds in pairs)
     for unknown in unknowns:
-        unknown.parameter.value_in(experiment)
         _refuse_beyond(unknown, experiment)
     observations = []
     for measurement in fit.measured:
@@ -222,6 +234,7 @@ def problem_of(
             text = f"there is no leader group {force.group}"
             raise ExperimentError(text, ("force", "group"))
     problem = Problem(unknowns, tuple(observations))
+    _refuse_changing_units(problem, fit)
     _refuse_underdetermined(problem)
     return problem
 
@@ -254,11 +267,40 @@ def _refuse_too_few(observation: Observation, unknowns: int) -> None:
         )
 
 
+def _unknown(path: str, bounds: AnyBounds, experiment: Experiment) -> Unknown:
+    """Return an unknown. Errors of its bounds name their place in the fit file."""
+    try:
+        return Unknown.of(path, bounds, experiment)
+    except ExperimentError as error:
+        if not isinstance(bounds[0], str):
+            raise
+        raise ExperimentError(str(error), ("unknown", path)) from None
+
+
+def _refuse_changing_units(problem: Problem, fit: Fit) -> None:
+    """Refuse values in units that depend on another modulus than that of `units`."""
+    moduli = [u.modulus for u in problem.unknowns if u.modulus is not None]
+    for measurement in fit.measured if moduli else ():
+        modulus = getattr(measurement, "youngs_modulus", None)
+        if modulus is not None and not np.isclose(modulus, moduli[0]):
+            raise ExperimentError(
+                f"{modulus:g} differs from {moduli[0]:g} of units.youngs_modulus, by which bounds "
+                "with a unit are divided; use the same value",
+                ("measured", "youngs_modulus"),
+            )
+    if moduli and problem.with_modulus and (fit.profile or fit.sampler):
+        raise ExperimentError(
+            "a `profile` or `sampler` requires a known modulus if bounds are stresses, forces or "
+            "energies; give `youngs_modulus` of the curve",
+            ("unknown",),
+        )
+
+
 def _refuse_beyond(unknown: Unknown, experiment: Experiment) -> None:
     for end in (unknown.low, unknown.high):
         value = end + INSET * (unknown.low + unknown.high - 2.0 * end)
         try:
-            unknown.parameter.put(experiment, value)
+            unknown.put(experiment, value)
         except ExperimentError as error:
             path = unknown.parameter.path
             text = f"a bound is not valid in the experiment: {error}"
@@ -277,12 +319,16 @@ def _refuse_underdetermined(problem: Problem) -> None:
 
 
 def _solve(problem: Problem, fit: Fit) -> tuple[Problem, Solution]:
-    """Solve the problem. If the noise is not given, estimate it from the residuals.
+    """Solve the problem. Noise that is not given is estimated from the residuals.
 
     The standard errors account for correlated residuals.
     """
-    if fit.measured[0].noise is not None:
+    unknown = [n for n, measurement in enumerate(fit.measured) if measurement.noise is None]
+    if not unknown:
         problem, solution = solve(problem, problem.start(), fit.loss)
+        return problem, with_correlated_errors(problem, solution, fit.loss)
+    if len(problem.observations) > 1:
+        problem, solution = _solve_for_noises(problem, fit, unknown)
         return problem, with_correlated_errors(problem, solution, fit.loss)
     (observation,) = problem.observations
     problem = replace(
@@ -299,6 +345,72 @@ def _solve(problem: Problem, fit: Fit) -> tuple[Problem, Solution]:
         )
         problem, solution = solve(problem, solution.z, fit.loss)
     return problem, with_correlated_errors(problem, solution, fit.loss)
+
+
+def _solve_for_noises(
+    problem: Problem, fit: Fit, unknown: Sequence[int]
+) -> tuple[Problem, Solution]:
+    """Solve a problem with several measurements, of which the noise of some is unknown.
+
+    Parameters
+    ----------
+    unknown
+        Indices of the measurements with unknown noise.
+
+    Notes
+    -----
+    Variance components are estimated by iteration (Förstner 1979): the variance of a measurement is
+    the sum of its squared residuals, divided by its redundancy. The redundancy is the number of
+    values minus the trace of the part of the hat matrix that belongs to them.
+    """
+    sizes = {n: _size(problem.observations[n].measured) for n in unknown}
+    noises = {n: COARSE * size for n, size in sizes.items()}
+    z = None
+    for _ in range(MAX_NOISE_ITERATIONS):
+        problem = _with_noises(problem, noises)
+        problem, solution = solve(problem, problem.start() if z is None else z, fit.loss)
+        ratios, previous = _noise_ratios(problem, solution, fit.loss), noises
+        noises = {n: max(ratios[n] * previous[n], TINY * sizes[n]) for n in unknown}
+        if max(abs(np.log(noises[n] / previous[n])) for n in unknown) <= NOISE_RTOL:
+            return problem, solution
+        z = solution.z
+    raise UnconvergedError(
+        f"the noise of the measurements has not converged after {MAX_NOISE_ITERATIONS} fits; give "
+        "the `noise` of each"
+    )
+
+
+def _with_noises(problem: Problem, noises: Mapping[int, float]) -> Problem:
+    observations = [
+        observation.with_noise(noises.get(n, observation.noise))
+        for n, observation in enumerate(problem.observations)
+    ]
+    return replace(problem, observations=tuple(observations))
+
+
+def _noise_ratios(problem: Problem, solution: Solution, loss: Loss) -> list[float]:
+    """Return the standard deviation of the residuals of each measurement, over its noise.
+
+    Raises
+    ------
+    ExperimentError
+        If the unknowns adapt to all values of a measurement.
+    """
+    linearisation, ratios = solution.at, list[float]()
+    hat = hat_diagonal(linearisation.jacobian)
+    for n, (observation, rows) in enumerate(problem.rows()):
+        residuals = linearisation.residuals[rows] / np.sqrt(observation.weight)
+        redundancy = len(residuals) - float(hat[rows].sum())
+        if redundancy < MIN_REDUNDANCY:
+            raise ExperimentError(
+                f"the {len(residuals)} values of measurement {n} determine {hat[rows].sum():.1f} "
+                "unknowns, so that their noise cannot be estimated; give its `noise`",
+                ("measured",),
+            )
+        spread = spread_of(residuals, 0, loss)
+        scale = np.sqrt(len(residuals) / redundancy) if loss == "linear" else 1.0
+        ratios.append(float(spread * scale))
+    return ratios
 
 
 def _size(measured: Floats) -> float:

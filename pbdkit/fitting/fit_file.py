@@ -10,7 +10,7 @@ from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, TypeVar
 
 import numpy as np
 from pydantic import (
@@ -26,7 +26,20 @@ from pydantic import (
 )
 
 from pbdkit.array_types import Floats
+from pbdkit.components.gauges import Extensometer, Gauge, StrainGauge
 from pbdkit.errors import ExperimentError, did_you_mean
+from pbdkit.fitting.channels import (
+    Channel,
+    ControlledOpening,
+    GaugeReading,
+    GroupDisplacement,
+    GroupForce,
+    LoadDisplacement,
+    LoadForce,
+    Time,
+    direction_of_load,
+    unit_vector,
+)
 from pbdkit.fitting.formula import Formula
 from pbdkit.fitting.observations import (
     CurveObservation,
@@ -36,6 +49,7 @@ from pbdkit.fitting.observations import (
     Observation,
     TracksObservation,
     deeper,
+    read_at,
 )
 from pbdkit.fitting.problem import Loss
 from pbdkit.model.experiment import Experiment, Version
@@ -50,10 +64,10 @@ from pbdkit.model.reading import (
     read_file,
 )
 from pbdkit.model.schema import DIALECT
-from pbdkit.model.solver import Equilibrium
+from pbdkit.model.solver import Equilibrium, Toward
 from pbdkit.model.validation import closed_part, fault, read_columns, report
 from pbdkit.plugin.component import Component, Strict
-from pbdkit.plugin.units import LENGTH
+from pbdkit.plugin.units import LENGTH, number_with_unit
 from pbdkit.scene.scene import Scene, build_scene
 
 if TYPE_CHECKING:
@@ -88,8 +102,7 @@ SpecimenName = Annotated[
 """Name of a specimen; a number is read as text."""
 Count = Annotated[int, Field(ge=0, le=40)] | Literal["auto"]
 ModesOfGroups = Modes | tuple[Modes, ...]
-DIRECTIONS = {"x": (1.0, 0.0), "y": (0.0, 1.0)}
-"""Unit vectors of the axes."""
+Axes = Annotated[tuple[Literal["x", "y"], ...], Field(strict=False, min_length=1, max_length=2)]
 
 
 class Force(Strict):
@@ -107,9 +120,10 @@ class MeasuredColumns(Component):
     """A measurement: columns of a CSV `file` in the folder of the fit file.
 
     `specimen` is the name of the measured specimen, if the fit has several. `noise` is the standard
-    deviation of the measured values; by default it is estimated from the residuals. A `weight` of 4
-    has the same effect as half the noise. `settings` are changes of the experiment, by path, for
-    this measurement only, for instance another load or another number of steps.
+    deviation of the measured values; by default it is estimated from the residuals of this
+    measurement. A `weight` of 4 has the same effect as half the noise. `settings` are changes of
+    the experiment, by path, for this measurement only, for instance another load or another number
+    of steps.
     """
 
     file: str
@@ -199,21 +213,65 @@ def _without_type(schema: dict[str, Any]) -> None:
     schema["required"] = [key for key in schema["required"] if key != "type"]
 
 
-class MeasuredField(MeasuredColumns):
+class MeasuredDisplacements(MeasuredColumns):
+    """Displacements at points.
+
+    `axes` are the axes along which they are measured, by default both. The last `columns` are the
+    displacements along these axes.
+    """
+
+    first_columns: ClassVar[tuple[str, ...]]
+
+    axes: Axes = ("x", "y")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _columns_of_axes(cls, data: Any) -> Any:
+        """Set the default of `columns` for `axes`, and compare the numbers of both."""
+        axes = data.get("axes", ["x", "y"]) if isinstance(data, Mapping) else None
+        if not isinstance(axes, (list, tuple)) or not {*map(str, axes)} <= {"x", "y"}:
+            return data
+        expected = [*cls.first_columns, *(f"u{axis}" for axis in axes)]
+        columns = data.get("columns", expected)
+        if isinstance(columns, (list, tuple)) and len(columns) != len(expected):
+            raise fault(
+                f"expected {len(expected)} columns, for {', '.join(expected)}, got {len(columns)}",
+                key="columns",
+            )
+        return {**data, "columns": columns}
+
+    @property
+    def measured_axes(self) -> tuple[int, ...]:
+        """Return the indices of the measured axes."""
+        return tuple("xy".index(axis) for axis in self.axes)
+
+
+class MeasuredField(MeasuredDisplacements):
     """Displacements of a body in equilibrium at scattered points, in lattice units.
 
-    Points that are closer to the outline of the body than `margin` are not used. `force` is the
-    force of a leader group during this measurement. It replaces `force` of the fit, and is required
-    here if several specimens are measured under different forces.
+    `axes` are the axes along which they are measured, by default both; with `axes: [x]` the columns
+    are x, y and ux. Points that are closer to the outline of the body than `margin` are not used.
+    `force` is the force of a leader group during this measurement. It replaces `force` of the fit,
+    and is required here if several specimens are measured under different forces.
     """
 
     model_config = ConfigDict(json_schema_extra=_without_type)
+    first_columns = ("x", "y")
 
     type: Literal["field"] = "field"
-    columns: Annotated[tuple[str, str, str, str], Field(strict=False)] = ("x", "y", "ux", "uy")
+    columns: Annotated[tuple[str, ...], Field(strict=False)] = ("x", "y", "ux", "uy")
     margin: Annotated[float, Field(ge=0.0)] = 0.0
     distortion: Distortion = Field(default_factory=Distortion)
     force: Force | None = None
+
+    @model_validator(mode="after")
+    def _distortion_of_measured_axes(self) -> Self:
+        for axis in "xy":
+            if axis not in self.axes and getattr(self.distortion, f"u{axis}"):
+                raise fault(
+                    f"has terms of u{axis}, which is not measured; remove them", key="distortion"
+                )
+        return self
 
     def observation(self, experiment: Experiment, modes: ModesOfGroups) -> FieldObservation:
         """Return the observation of an equilibrium. The solver of the experiment is not used."""
@@ -225,63 +283,124 @@ class MeasuredField(MeasuredColumns):
         if self.margin:
             inside = deeper(experiment.body, experiment.lattice, points, self.margin)
         terms = self.distortion.ux, self.distortion.uy
-        evidence = FieldEvidence.of(scene, points[inside], displacements[inside], terms)
+        evidence = FieldEvidence.of(
+            scene, points[inside], displacements[inside], terms, self.measured_axes
+        )
         _refuse_other_unit(evidence.points, scene)
         return FieldObservation.of(scene, evidence, self.assumed_noise, modes, inside)
 
 
-class MeasuredTracks(MeasuredColumns):
+class MeasuredTracks(MeasuredDisplacements):
     """Displacements of points of the moving body. Each row contains a `time`, in steps, the
     coordinates x and y of a point in the reference configuration, and its displacement at that
-    time."""
+    time. `axes` are the axes along which displacements are measured, by default both."""
+
+    first_columns = ("time", "x", "y")
 
     type: Literal["tracks"] = "tracks"
-    columns: Annotated[tuple[str, str, str, str, str], Field(strict=False)] = (
-        "time",
-        "x",
-        "y",
-        "ux",
-        "uy",
-    )
+    columns: Annotated[tuple[str, ...], Field(strict=False)] = ("time", "x", "y", "ux", "uy")
 
     def observation(self, experiment: Experiment, modes: ModesOfGroups) -> TracksObservation:
         """Return the observation of a run."""
         times, points, u = self.rows[:, 0], self.rows[:, 1:3], self.rows[:, 3:]
-        return TracksObservation.of(experiment, times, points, u, self.assumed_noise)
+        return TracksObservation.of(
+            experiment, times, points, u, self.assumed_noise, self.measured_axes
+        )
+
+
+AnyGauge = Annotated[SerializeAsAny[Gauge], closed_part(Gauge, Extensometer, StrainGauge)]
+"""Type of a gauge."""
 
 
 class MeasuredCurve(MeasuredColumns):
-    """The force that the leader group `group` exerts along `axis` as a function of its displacement
-    along this axis or, with `against: time`, of the time in steps. `thickness` is the thickness of
-    the tested body. By default, `youngs_modulus` is fitted too. Units are N, mm and MPa if the
-    experiment has units."""
+    """A quantity as a function of another one.
+
+    By default it is the force that the leader group `group` exerts along `axis`, or the force of
+    the load `load`. `quantity` can also be a gauge: an extensometer or a strain gauge. It is
+    measured `against` the displacement of the group or load along `axis`, against `time` in steps,
+    the `opening` that the control of the solver prescribes, or a gauge. `axis` is x, y or a vector;
+    the default is x for a group, and the direction of the force for a load. `thickness` is the
+    thickness of the tested body, by default that of `units` or 1. By default, `youngs_modulus` is
+    fitted too. Forces are in N, the modulus in MPa and the thickness in mm if the experiment has
+    units. Lengths are in lattice units.
+    """
 
     type: Literal["curve"] = "curve"
-    group: Annotated[int, Field(ge=0)]
-    axis: Literal["x", "y"] = "x"
-    against: Literal["displacement", "time"] = "displacement"
-    thickness: Positive = 1.0
+    quantity: Literal["force"] | AnyGauge = "force"
+    against: Literal["displacement", "time", "opening"] | AnyGauge = "displacement"
+    group: Annotated[int, Field(ge=0)] | None = None
+    load: Annotated[int, Field(ge=0)] | None = None
+    axis: Literal["x", "y"] | Toward | None = None
+    thickness: Positive | None = None
     youngs_modulus: Positive | None = None
     columns: Annotated[tuple[str, str], Field(strict=False)] = ("displacement", "force")
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        needs = self.quantity == "force" or self.against == "displacement"
+        if self.group is not None and self.load is not None:
+            raise fault("the curve has a `group` and a `load`; give one of them", key="load")
+        if needs and self.group is None and self.load is None:
+            raise fault("is missing; give the `group` or the `load` of the force", key="group")
+        if isinstance(self.axis, tuple) and not any(self.axis):
+            raise fault("the axis is a zero vector; give one, such as [1, 0]", key="axis")
+        return self
+
+    @property
+    def measures_force(self) -> bool:
+        """Return whether the measured quantity is a force."""
+        return self.quantity == "force"
 
     def observation(self, experiment: Experiment, modes: ModesOfGroups) -> CurveObservation:
         """Return the observation of a run.
 
         Forces are divided by the thickness and by a known modulus.
         """
-        scale = self.thickness * (self.youngs_modulus or 1.0)
-        scale *= experiment.units.length_mm if experiment.units else 1.0
+        scene, scale = read_at(experiment), 1.0
+        if self.measures_force:
+            scale = self._thickness(experiment) * (self.youngs_modulus or 1.0)
+            scale *= experiment.units.length_mm if experiment.units else 1.0
         curve = CurveObservation.of(
-            experiment,
+            scene,
             self.rows[:, 0],
             self.rows[:, 1] / scale,
             self.assumed_noise / scale,
-            self.group,
-            DIRECTIONS[self.axis],
-            at_times=self.against == "time",
-            scaled=self.youngs_modulus is None,
+            self._channels(scene),
+            scaled=self.measures_force and self.youngs_modulus is None,
         )
         return replace(curve, unit=scale)
+
+    def _thickness(self, experiment: Experiment) -> float:
+        units = experiment.units
+        return self.thickness or (units and units.value("thickness")) or 1.0
+
+    def _channels(self, scene: Scene) -> tuple[Channel, Channel]:
+        """Return the measured channel, and the channel of the abscissae."""
+        if self.group is not None and self.group >= len(scene.leading):
+            raise ExperimentError(f"there is no leader group {self.group}", ("measured", "group"))
+        force, displacement = self._of_group_or_load(scene)
+        value = GaugeReading(self.quantity) if isinstance(self.quantity, Gauge) else force
+        over: Channel | None
+        if isinstance(self.against, Gauge):
+            over = GaugeReading(self.against)
+        elif self.against == "opening":
+            over = ControlledOpening.of(scene)
+        else:
+            over = Time() if self.against == "time" else displacement
+        assert value is not None
+        assert over is not None
+        return value, over
+
+    def _of_group_or_load(self, scene: Scene) -> tuple[Channel | None, Channel | None]:
+        """Return force and displacement of the group or load."""
+        if self.load is not None:
+            default = direction_of_load(scene, self.load)
+            direction = unit_vector(self.axis) if self.axis else default
+            return LoadForce(self.load, direction), LoadDisplacement(self.load, direction)
+        if self.group is None:
+            return None, None
+        direction = unit_vector(self.axis or "x")
+        return GroupForce(self.group, direction), GroupDisplacement(self.group, direction)
 
 
 def _refuse_other_unit(points: Floats, scene: Scene) -> None:
@@ -336,7 +455,18 @@ def _two(bounds: Pair) -> Pair:
     return bounds
 
 
+def _in_one_unit(bounds: tuple[str, str]) -> tuple[str, str]:
+    (low, unit), (high, other) = map(number_with_unit, bounds)
+    if unit != other:
+        raise ValueError(f"expected bounds in the same unit, got {unit} and {other}")
+    _two((low, high))
+    return bounds
+
+
 Bounds = Annotated[Pair, AfterValidator(_two)]
+UnitBounds = Annotated[tuple[str, str], Field(strict=False), AfterValidator(_in_one_unit)]
+AnyBounds = Bounds | UnitBounds
+"""Type of bounds: two numbers, or two texts with a unit."""
 
 
 def _formula(text: str) -> str:
@@ -368,7 +498,7 @@ class AlternativeModel(Strict):
     """
 
     settings: Annotated[dict[str, Any], Field(min_length=1)]
-    unknown: Annotated[dict[str, Bounds], Field(min_length=1)] | None = None
+    unknown: dict[str, AnyBounds] | None = None
 
 
 class Sampler(Strict):
@@ -385,6 +515,9 @@ class Sampler(Strict):
 class Fit(Strict):
     """Fits the `unknown` parameters of an experiment, within bounds, to one or several
     measurements, which are fields in equilibrium, tracks or curves.
+
+    Bounds are numbers as in the experiment or, with `units`, texts such as 2 MPa. Without unknown
+    parameters, Young's modulus alone is fitted.
 
     If a leader group has the motion `measured`, its displacement along each axis is a sum of
     `modes` smooth functions with amplitudes that are also fitted. By default, `auto`, the data
@@ -410,7 +543,7 @@ class Fit(Strict):
 
     version: Version = 1
     experiment: Base
-    unknown: dict[str, Bounds]
+    unknown: dict[str, AnyBounds]
     measured: Measurements
     specimens: bool = False
     force: Force | None = None
@@ -490,12 +623,6 @@ class Fit(Strict):
         force = self.measured_force
         if any(getattr(measurement, "force", None) for measurement in self.measured[1:]):
             raise ValueError("give `force` at the first measurement of a specimen, or for the fit")
-        if len(self.measured) > 1 and any(
-            measurement.noise is None for measurement in self.measured
-        ):
-            raise ValueError(
-                "several measurements require the `noise` of each, which determines their weights"
-            )
         if force and not isinstance(self.measured[0], MeasuredField):
             raise ValueError(
                 "`force` is the force of a group in equilibrium while a field is measured; give "
@@ -508,7 +635,9 @@ class Fit(Strict):
         curves_without_modulus = [
             measurement
             for measurement in self.measured
-            if isinstance(measurement, MeasuredCurve) and not measurement.youngs_modulus
+            if isinstance(measurement, MeasuredCurve)
+            and measurement.measures_force
+            and not measurement.youngs_modulus
         ]
         if not (self.unknown or force or curves_without_modulus or self.derived or self.crack_tip):
             raise ValueError(

@@ -59,11 +59,14 @@ class FittedField:
         Measured displacements minus the fitted distortion.
     residual : array of float, shape (point, axis)
         Measured minus fitted displacements.
+    components : tuple of str
+        Measured components, in the order of the columns of the arrays.
     """
 
     points: Floats
     measured: Floats
     residual: Floats
+    components: tuple[str, ...] = ("ux", "uy")
 
 
 @dataclass(frozen=True)
@@ -372,8 +375,9 @@ class Fitted:
         strengths = values[len(values) - evidence.distortions.shape[1] :]
         measured = evidence.measured - evidence.distortions @ strengths
         residual = self.solution.at.residuals[rows] * observation.weighted_noise
+        count, names = len(evidence.axes), tuple(f"u{'xy'[axis]}" for axis in evidence.axes)
         return FittedField(
-            evidence.points, measured.reshape(2, -1).T, np.asarray(residual.reshape(2, -1).T)
+            evidence.points, measured.reshape(count, -1).T, residual.reshape(count, -1).T, names
         )
 
     def modes(self, n: int = 0) -> dict[int, int]:
@@ -530,6 +534,7 @@ def fitted(fit: Fit, problem: Problem, solution: Solution) -> Fitted:
             float(error),
             unknown.parameter.path not in solution.unidentified,
             unknown.parameter.path in solution.on_bounds,
+            unit=unknown.unit,
             growth=float(growth),
         )
         for unknown, value, error, growth in zip(
@@ -610,11 +615,10 @@ def _residuals_of(
 def unit_of(observation: Observation) -> tuple[float, str]:
     """Return the factor and the unit that convert an observation to the units of the experiment.
 
-    Forces are in N, and lengths in lattice units. Without units, the factor is 1, and the unit is
-    an empty text.
+    Forces are in N, and lengths in lattice units. Without units, and for strains, the factor is 1,
+    and the unit is an empty text.
     """
-    units = observation.experiment.units
-    if units is None:
+    units, quantity = observation.experiment.units, observation.quantity
+    if units is None or quantity is None:
         return 1.0, ""
-    is_force = isinstance(observation, CurveObservation)
-    return (1.0, FORCE.unit) if is_force else (units.length_mm, LENGTH.unit)
+    return (1.0, FORCE.unit) if quantity is FORCE else (units.length_mm, LENGTH.unit)

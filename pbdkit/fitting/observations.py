@@ -30,6 +30,7 @@ from pbdkit.components.diagnostics import reactions
 from pbdkit.components.stress_intensity import Frame, IsotropicPlane, auxiliary
 from pbdkit.equilibrium.error_bound import UnconvergedError
 from pbdkit.errors import ExperimentError
+from pbdkit.fitting.channels import Channel, Time
 from pbdkit.fitting.parameter import Parameter
 from pbdkit.fitting.sensitivity import RestingScene, scene_like
 from pbdkit.io.snapshot import StateMoment, Tables
@@ -53,6 +54,7 @@ from pbdkit.model.experiment import Experiment
 from pbdkit.model.motions import Measured
 from pbdkit.model.solver import Record
 from pbdkit.plugin import Lattice
+from pbdkit.plugin.units import LENGTH, Quantity
 from pbdkit.scene.leader_groups import Leading
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.simulation import FAILED, Simulation
@@ -417,7 +419,7 @@ class FieldEvidence:
     points : (point, axis)
         Points within the body.
     measured : (axis · point,)
-        Displacements along x of all points, then those along y.
+        Displacements along the first measured axis of all points, then those along the second one.
     interpolation
         Interpolation at the points.
     terms
@@ -427,6 +429,8 @@ class FieldEvidence:
     tip
         Fields at a crack tip that the measured field contains in addition to the displacements of
         the body, if the position of the tip is unknown.
+    axes
+        Indices of the measured axes.
     """
 
     points: Floats
@@ -435,6 +439,7 @@ class FieldEvidence:
     terms: tuple[tuple[tuple[int, int], ...], ...]
     box: tuple[Floats, Floats]
     tip: TipFields | None = None
+    axes: tuple[int, ...] = (0, 1)
 
     @classmethod
     def of(
@@ -443,20 +448,22 @@ class FieldEvidence:
         points: Floats,
         displacements: Floats,
         terms: tuple[tuple[tuple[int, int], ...], ...] = ((), ()),
+        axes: tuple[int, ...] = (0, 1),
     ) -> FieldEvidence:
         """Return the field at those scattered points (point, axis) that lie inside the body."""
         interpolation = Interpolation.at(scene, points)
         inside = interpolation.inside
         points = points[inside]
         box = (points.min(axis=0), points.max(axis=0)) if len(points) else (points[0:1], points)
-        return cls(points, displacements[inside].T.ravel(), interpolation, terms, box)
+        measured = displacements[inside].T.ravel()
+        return cls(points, measured, interpolation, terms, box, axes=axes)
 
     def part(self, mask: NDArray[np.bool_]) -> FieldEvidence:
         """Select some of the points."""
         return replace(
             self,
             points=self.points[mask],
-            measured=self.measured.reshape(2, -1)[:, mask].ravel(),
+            measured=self.measured.reshape(len(self.axes), -1)[:, mask].ravel(),
             interpolation=self.interpolation.part(mask),
         )
 
@@ -469,18 +476,22 @@ class FieldEvidence:
         """
         low, high = self.box
         x, y = (2.0 * (self.points - low) / np.maximum(high - low, 1e-300) - 1.0).T
-        n = len(x)
-        columns = [*self.tip.at(self.points).T] if self.tip else []
-        for axis, terms in enumerate(self.terms):
-            for p, q in terms:
-                column = np.zeros(2 * n)
-                column[axis * n : (axis + 1) * n] = x**p * y**q
+        n, places = len(x), list(self.axes)
+        columns = []
+        if self.tip:
+            fields = self.tip.at(self.points)
+            columns = [*fields.reshape(2, n, -1)[places].reshape(-1, fields.shape[1]).T]
+        for place, axis in enumerate(self.axes):
+            for p, q in self.terms[axis]:
+                column = np.zeros(len(self.axes) * n)
+                column[place * n : (place + 1) * n] = x**p * y**q
                 columns.append(column)
-        return np.stack(columns, axis=1) if columns else np.zeros((2 * n, 0))
+        return np.stack(columns, axis=1) if columns else np.zeros((len(self.axes) * n, 0))
 
     def predict(self, planes: Floats, resting_scene: RestingScene) -> Floats:
         """Interpolate displacements at the points. They are given as rasters."""
-        return self.interpolation.of(planes, resting_scene.scene).T.ravel()
+        displacements = self.interpolation.of(planes, resting_scene.scene)
+        return displacements[:, list(self.axes)].T.ravel()
 
 
 @dataclass(frozen=True)
@@ -628,6 +639,16 @@ class Observation(ABC):
         return False
 
     @property
+    def is_smooth(self) -> bool:
+        """Return whether predictions are smooth functions of the parameters."""
+        return True
+
+    @property
+    def quantity(self) -> Quantity | None:
+        """Quantity of the measured numbers; None if they have no dimension."""
+        return LENGTH
+
+    @property
     def own_unknowns(self) -> int:
         """Return the number of unknowns that only this observation has."""
         return 0
@@ -720,11 +741,63 @@ def read_at(experiment: Experiment, steps: Sequence[int] | None = None) -> Scene
     return build_scene(experiment.model_copy(update=changed))
 
 
+MAX_CACHED_RUNS = 24
+"""Maximum number of runs with a control of which the predictions are kept."""
+CLOSE_SECANT = 0.05
+"""Largest change of parameters after which derivatives of a run with a control are reused, as a
+fraction of the interval between the bounds."""
+
+
+@dataclass(frozen=True)
+class RunPrediction(Prediction):
+    """Prediction of a run.
+
+    Parameters
+    ----------
+    columns
+        Derivatives of the predictions of the run with respect to the parameters.
+    away
+        Difference between the parameters and those of `columns`, as in `NearbyPrediction`.
+    """
+
+    columns: tuple[Floats, ...] = ()
+    away: float = 0.0
+
+    @property
+    def is_exact(self) -> bool:
+        """Return whether the derivatives are those at the values of the parameters."""
+        return self.away == 0.0
+
+
 @dataclass(frozen=True, kw_only=True)
 class RunObservation(Observation):
-    """Measured values that are predicted by a run."""
+    """Measured values that are predicted by a run.
+
+    If the run has a control, it follows a softening body, and the predictions are continuous but
+    not smooth functions of the parameters: the slope of a curve changes where a cell begins to
+    soften. Derivatives are then differences over a finite change of the parameters.
+
+    Parameters
+    ----------
+    scene
+        Scene of the run.
+    runs
+        Cache of the last runs with a control: their experiments, rows and predictions.
+    """
 
     scene: Scene
+    runs: list[tuple[Experiment, NDArray[np.intp], Floats]] = field(
+        default_factory=list, repr=False, compare=False
+    )
+
+    @property
+    def _is_controlled(self) -> bool:
+        return self.scene.experiment.solver.equilibrium.control is not None
+
+    @property
+    def is_smooth(self) -> bool:
+        """Return whether predictions are smooth functions of the parameters."""
+        return not self._is_controlled
 
     def at(
         self,
@@ -735,23 +808,39 @@ class RunObservation(Observation):
         near: NearbyPrediction | None = None,
     ) -> Prediction:
         """Predict the measured values by one run, and derivatives by eight runs for each
-        parameter."""
-        predicted, broken, steps = self._run(experiment)
-        columns = [self._change(experiment, parameter, broken, steps) for parameter in parameters]
+        parameter, or by two if the run has a control."""
+        away = 0.0
+        if self._is_controlled:
+            predicted, away = self._followed(experiment), np.inf
+            if near and isinstance(near.prediction, RunPrediction):
+                columns, away = near.prediction.columns, near.prediction.away + near.away
+            if away >= CLOSE_SECANT:
+                columns, away = self._differences(experiment, parameters), 0.0
+        else:
+            predicted, broken, steps = self._run(experiment)
+            columns = tuple(self._change(experiment, each, broken, steps) for each in parameters)
         rows = len(self.measured)
         scale = modulus if self.needs_modulus else 1.0
-        return Prediction(
+        return RunPrediction(
             (self.measured - scale * predicted) / self.weighted_noise,
             scale * np.array(columns).T.reshape(rows, len(columns)) / self.weighted_noise,
             np.zeros((rows, 0)),
             predicted / self.weighted_noise if self.needs_modulus else np.zeros(rows),
+            columns,
+            away,
         )
+
+    def _differences(
+        self, experiment: Experiment, parameters: Sequence[Parameter]
+    ) -> tuple[Floats, ...]:
+        """Return the derivatives of predictions under a control, as quotients of differences."""
+        return tuple(each.difference(experiment, self._followed) for each in parameters)
 
     def modulus_terms(self, experiment: Experiment) -> tuple[float, float]:
         """Compute the two sums from one run."""
         if not self.needs_modulus:
             return 0.0, 0.0
-        predicted, *_ = self._run(experiment)
+        predicted = self._followed(experiment) if self._is_controlled else self._run(experiment)[0]
         variance = self.weighted_noise**2
         return float(self.measured @ predicted) / variance, float(predicted @ predicted) / variance
 
@@ -771,6 +860,26 @@ class RunObservation(Observation):
             return numbers
 
         return np.asarray(parameter.derivative(experiment, predicted))
+
+    def _followed(self, experiment: Experiment) -> Floats:
+        """Return the predictions of a run with a control, or those of an equal run that is cached.
+
+        Raises
+        ------
+        UnconvergedError
+            If the branch cannot be followed, or its model is invalid on this lattice.
+        """
+        for n, (cached, rows, numbers) in enumerate(self.runs):
+            if rows is self.rows and cached == experiment:
+                self.runs.append(self.runs.pop(n))
+                return numbers
+        try:
+            numbers, *_ = self._run(experiment)
+        except ExperimentError as error:
+            raise UnconvergedError(str(error)) from None
+        self.runs.append((experiment, self.rows, numbers))
+        del self.runs[:-MAX_CACHED_RUNS]
+        return numbers
 
     def _run(self, experiment: Experiment) -> tuple[Floats, Floats, int]:
         """Return the predictions, the step in which each bond broke, and the number of steps."""
@@ -823,30 +932,24 @@ SLACK = 1e-9
 
 @dataclass(frozen=True, kw_only=True)
 class CurveObservation(RunObservation):
-    """Force of a leader group along a direction, as a function of its displacement or of time.
+    """A channel of a run as a function of another channel, such as force over displacement.
 
-    As a function of displacement, the curve ends where the group stops or reverses its motion.
-    Forces are divided by the thickness and, if it is known, by Young's modulus. They are
-    interpolated linearly between recorded steps.
+    The curve ends where the abscissa stops or reverses. Forces are divided by the thickness and, if
+    it is known, by Young's modulus. Values are interpolated linearly between recorded steps.
 
     Parameters
     ----------
-    group
-        Number of the group.
-    direction
-        Unit vector.
-    at_times
-        Whether the force is a function of time.
+    value, over
+        Measured channel, and the channel of which it is a function.
     scaled
-        Whether Young's modulus is unknown.
+        Whether the value is a force and Young's modulus is unknown.
     along : (number,)
-        Displacements or times.
+        Values of `over`.
     """
 
     kind: ClassVar[str] = "curve"
-    group: int
-    direction: tuple[float, float]
-    at_times: bool
+    value: Channel
+    over: Channel
     scaled: bool
     along: Floats
 
@@ -855,55 +958,67 @@ class CurveObservation(RunObservation):
         """Return whether Young's modulus is unknown."""
         return self.scaled
 
+    @property
+    def quantity(self) -> Quantity | None:
+        """Quantity of the measured channel."""
+        return self.value.quantity
+
+    @property
+    def at_times(self) -> bool:
+        """Return whether the curve is a function of time."""
+        return isinstance(self.over, Time)
+
     @classmethod
     def of(
         cls,
-        experiment: Experiment,
+        scene: Scene,
         places: Floats,
-        forces: Floats,
+        values: Floats,
         noise: float,
-        group: int,
-        direction: tuple[float, float],
+        channels: tuple[Channel, Channel],
         *,
-        at_times: bool,
         scaled: bool,
     ) -> CurveObservation:
         """Return the observation of a curve.
 
+        Parameters
+        ----------
+        scene
+            Scene of the run, as `read_at` returns it.
+        places, values : (number,)
+            Abscissae and ordinates.
+        channels
+            Measured channel, and the channel of the abscissae.
+
         Raises
         ------
         ExperimentError
-            If the group does not exist, or if the run does not reach the curve.
+            If the run does not reach the curve.
         """
-        scene = read_at(experiment)
-        if group >= len(scene.leading):
-            raise ExperimentError(f"there is no leader group {group}", ("measured", "group"))
         return cls(
-            experiment=experiment,
-            measured=forces,
+            experiment=scene.experiment,
+            measured=values,
             noise=noise,
-            rows=np.arange(len(forces)),
+            rows=np.arange(len(values)),
             scene=scene,
-            group=group,
-            direction=direction,
-            at_times=at_times,
+            value=channels[0],
+            over=channels[1],
             scaled=scaled,
             along=places,
         )._restricted_to_run()
 
     def _restricted_to_run(self) -> CurveObservation:
-        """Return the observation without the displacements that the run does not reach.
+        """Return the observation without the abscissae that the run does not reach.
 
         Raises
         ------
         ExperimentError
-            If no row remains. Also if the force is a function of time, and a time lies beyond the
+            If no row remains. Also if the values are functions of time, and a time lies beyond the
             run.
         """
-        reached, _ = self.curve(Simulation.of_scene(self.scene))
-        inside = (self.along >= reached.min()) & (self.along <= reached.max())
-        quantity = "times" if self.at_times else "displacements of the group"
-        range_text = f"the run's {quantity} go from {reached.min():g} to {reached.max():g}"
+        low, high = self.over.range_in(self.scene) or self._reached()
+        inside = (self.along >= low) & (self.along <= high)
+        range_text = f"in the run, the {self.over.label} goes from {low:g} to {high:g}"
         if not inside.any() or (self.at_times and not inside.all()):
             raise ExperimentError(
                 (
@@ -915,14 +1030,18 @@ class CurveObservation(RunObservation):
         left_out = int((~inside).sum())
         return replace(self.part(inside), left_out=left_out, left_out_because=range_text)
 
+    def _reached(self) -> tuple[float, float]:
+        """Run the experiment, and return the range of the abscissa."""
+        reached, _ = self.curve(Simulation.of_scene(self.scene))
+        return float(reached.min()), float(reached.max())
+
     @property
     def names(self) -> tuple[str, str, bool]:
         """Return labels of the values and of the abscissa, and whether the values are one curve."""
-        over = "time (step)" if self.at_times else f"displacement of group {self.group}"
-        return f"force on group {self.group}", over, True
+        return self.value.label, self.over.label, True
 
     def places(self) -> Floats:
-        """Return the displacements or times."""
+        """Return the abscissae."""
         return self.along[:, None]
 
     def part(self, mask: NDArray[np.bool_]) -> CurveObservation:
@@ -930,42 +1049,47 @@ class CurveObservation(RunObservation):
         return replace(super().part(mask), along=self.along[mask])
 
     def _read(self, run: Simulation) -> Floats:
-        reached, force = self.curve(run)
+        reached, values = self.curve(run)
         slack = SLACK * (reached.max() - reached.min())
         if self.along.min() < reached.min() - slack or self.along.max() > reached.max() + slack:
             raise UnconvergedError(
-                f"the group goes from {reached.min():g} to {reached.max():g}, but the curve from "
-                f"{self.along.min():g} to {self.along.max():g}"
+                f"the {self.over.label} goes from {reached.min():g} to {reached.max():g}, but the "
+                f"curve from {self.along.min():g} to {self.along.max():g}"
             )
-        return np.interp(self.along, reached, force)
+        return np.interp(self.along, reached, values)
 
     def curve(self, run: Simulation) -> tuple[Floats, Floats]:
-        """Return displacements or times, and forces, at recorded steps, (step,).
+        """Return abscissae and values at recorded steps, (step,).
 
-        Forces are divided by Young's modulus and thickness. The curve ends where the group stops or
-        reverses its motion. After a run has converged, the force is constant.
+        Forces are divided by Young's modulus and thickness. The curve ends where the abscissa stops
+        or reverses. After a run has converged, values are constant.
         """
-        tables, places, forces = Tables(run.scene), [], []
-        for moment, state in self._recorded(run):
-            places.append(moment if self.at_times else self._displacement(state))
-            forces.append(np.dot(self.direction, reactions(StateMoment(state, tables))[self.group]))
+        tables, places, values = Tables(run.scene), list[float](), list[float]()
+        try:
+            for time, state in self._recorded(run):
+                places.append(self.over.read(time, state, tables))
+                values.append(self.value.read(time, state, tables))
+                if self._is_controlled and self._is_within(places):
+                    break
+        except UnconvergedError:
+            if not self._is_within(places):
+                raise
         if self.at_times and places[-1] < self.experiment.steps:
             places.append(self.experiment.steps)
-            forces.append(forces[-1])
-        return _monotonic_part(np.array(places, float), np.array(forces))
+            values.append(values[-1])
+        return _monotonic_part(np.array(places, float), np.array(values), self.over.label)
 
-    def _displacement(self, state: State) -> float:
-        place = self._leading_place
-        flat = state.u.reshape(len(state.u), -1)[:, place]
-        return float(np.dot(self.direction, flat.mean(axis=1)))
-
-    @cached_property
-    def _leading_place(self) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
-        return np.asarray(self.scene.leading[self.group].place)
+    def _is_within(self, places: Sequence[float]) -> bool:
+        """Return whether the measured abscissae are within those of a run."""
+        return (
+            len(places) > 1 and min(places) <= self.along.min() and max(places) >= self.along.max()
+        )
 
 
-def _monotonic_part(places: Floats, forces: Floats) -> tuple[Floats, Floats]:
-    """Return the first monotonic part of the abscissae, in increasing order, and its forces.
+def _monotonic_part(
+    places: Floats, values: Floats, label: str = "displacement"
+) -> tuple[Floats, Floats]:
+    """Return the first monotonic part of the abscissae, in increasing order, and its values.
 
     Raises
     ------
@@ -976,15 +1100,15 @@ def _monotonic_part(places: Floats, forces: Floats) -> tuple[Floats, Floats]:
     if not signs.size or signs[0] == 0.0:
         raise ExperimentError(
             (
-                "the group does not move along the force in its first recorded step, so that a "
-                "displacement does not identify a step; give `against: time`"
+                f"the {label} does not change in the first recorded step, so that it does not "
+                "identify a step; give `against: time`, or another `axis`"
             ),
             ("measured", "against"),
         )
     turns = np.flatnonzero(signs != signs[0])
     count = int(turns[0]) + 1 if turns.size else len(places)
     order = slice(None) if signs[0] > 0.0 else slice(None, None, -1)
-    return places[:count][order], forces[:count][order]
+    return places[:count][order], values[:count][order]
 
 
 DERIVATIVES = 1e-5
@@ -1174,7 +1298,8 @@ ON_STEP = 1e-9
 
 @dataclass(frozen=True, kw_only=True)
 class TracksObservation(RunObservation):
-    """Measured displacements of points at times: those along x of all rows, then those along y.
+    """Measured displacements of points at times: those along the first measured axis of all rows,
+    then those along the second one.
 
     Predictions are interpolated linearly between steps and between particles, and are constant
     after a run has converged.
@@ -1187,16 +1312,25 @@ class TracksObservation(RunObservation):
         Points in the reference configuration.
     interpolation
         Interpolation at the points.
+    axes
+        Indices of the measured axes.
     """
 
     kind: ClassVar[str] = "tracks"
     along: Floats
     points: Floats
     interpolation: Interpolation
+    axes: tuple[int, ...] = (0, 1)
 
     @classmethod
     def of(
-        cls, experiment: Experiment, times: Floats, points: Floats, u: Floats, noise: float
+        cls,
+        experiment: Experiment,
+        times: Floats,
+        points: Floats,
+        u: Floats,
+        noise: float,
+        axes: tuple[int, ...] = (0, 1),
     ) -> TracksObservation:
         """Return the observation of times (row,), points (row, axis) and displacements (row, axis).
 
@@ -1228,6 +1362,7 @@ class TracksObservation(RunObservation):
             along=times[inside],
             points=points[inside],
             interpolation=interpolation,
+            axes=axes,
         )
 
     @property
@@ -1266,7 +1401,7 @@ class TracksObservation(RunObservation):
                 f"the run has no state at time {self.along[missing][0]:g}; remove this time",
                 ("measured", "file"),
             )
-        return np.asarray(displacements.T.ravel())
+        return np.asarray(displacements[:, list(self.axes)].T.ravel())
 
     def _add(self, displacements: Floats, weight: Floats, state: State, run: Simulation) -> None:
         """Add a weighted state to displacements, by row."""

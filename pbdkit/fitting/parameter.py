@@ -4,13 +4,14 @@ them."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
 
+from pbdkit.equilibrium.error_bound import UnconvergedError
 from pbdkit.errors import ExperimentError, did_you_mean
 from pbdkit.model.experiment import Experiment, given_classes
 from pbdkit.model.reading import with_value
@@ -28,6 +29,9 @@ LARGE_STEP = 1e-2
 
 Errors of the prediction are larger for these parts.
 """
+
+SECANT_STEP = 2e-2
+"""Step of differences, as a fraction of the value, of predictions that are not smooth."""
 
 MIN_STEP = 1e-7
 """Smallest step as a fraction of the value, used near a bound."""
@@ -70,7 +74,7 @@ class Parameter:
         ExperimentError
             If there is no number at the path.
         """
-        words = self.path.split(".")
+        words = self._names(experiment)
         # Leader groups may have thousands of values, which are converted only if necessary.
         value: Any = experiment.model_dump(
             mode="json", by_alias=True, exclude={"leaders"} - {*words}
@@ -95,8 +99,8 @@ class Parameter:
         ExperimentError
             If the value is invalid.
         """
-        part, _, rest = self.path.partition(".")
-        name, _, region = rest.partition(".")
+        part, *rest = self._names(experiment)
+        name, region = rest[0] if rest else "", ".".join(rest[1:])
         component = getattr(experiment, part) if part in PARTS else None
         if isinstance(component, TakesFields):
             field = component.varying.get(name)
@@ -108,16 +112,39 @@ class Parameter:
             if field_value is not None:
                 changed = self._changed(component, name, field_value, value)
                 return experiment.model_copy(update={part: changed})
-        source = experiment.as_written()
-        label = f"{self.path} = {value:.6g}"
-        source = with_value(source, self.path, value, label, Experiment.defaults())
-        changed_experiment = Experiment.build(source, given_classes(experiment))
-        is_separate = part in SEPARATE_PARTS
+        changed_experiment = self._rebuilt(experiment, value, f"{self.path} = {value:.6g}")
+        is_separate = part in (*PARTS, *SEPARATE_PARTS)
         return (
             experiment.model_copy(update={part: getattr(changed_experiment, part)})
             if is_separate
             else changed_experiment
         )
+
+    def number(self, experiment: Experiment, text: str) -> float:
+        """Return the number in the experiment that a text with a unit stands for.
+
+        Raises
+        ------
+        ExperimentError
+            If the text is not a valid value of the parameter.
+        """
+        return self.value_in(self._rebuilt(experiment, text, f"{self.path} = {text}"))
+
+    def _rebuilt(self, experiment: Experiment, value: float | str, label: str) -> Experiment:
+        """Return the experiment, built from its source with another value."""
+        words, source = self._names(experiment), experiment.as_written()
+        if names := _other_names(experiment, words[0]):
+            part = {names.get(name, name): entry for name, entry in source.data[words[0]].items()}
+            source = replace(source, data={**source.data, words[0]: part})
+        source = with_value(source, ".".join(words), value, label, Experiment.defaults())
+        return Experiment.build(source, given_classes(experiment))
+
+    def _names(self, experiment: Experiment) -> list[str]:
+        """Return the parts of the path, in which another name of a parameter is replaced."""
+        words = self.path.split(".")
+        if len(words) > 1:
+            words[1] = _other_names(experiment, words[0]).get(words[1], words[1])
+        return words
 
     def _changed(self, component: TakesFields, name: str, field_value: Any, value: float) -> Any:
         try:
@@ -172,6 +199,36 @@ class Parameter:
         changes += [function(above) - function(below) for above, below in ends[len(ORDER_4) :]]
         return sum(weight / step * change for weight, change in zip(WEIGHTS, changes, strict=True))
 
+    def difference(self, experiment: Experiment, function: Callable[[Experiment], Any]) -> Any:
+        """Return the quotient of differences of a function that is not smooth.
+
+        The parameter is changed by a fraction of its value in both directions, or in one of them if
+        there is no value in the other one.
+
+        Parameters
+        ----------
+        experiment
+            Experiment at which the quotient is taken.
+        function
+            Function that returns an array, given an experiment.
+
+        Raises
+        ------
+        UnconvergedError
+            If the function has no value at the experiment, or none in both directions.
+        """
+        value, points = self.value_in(experiment), dict[float, Any]()
+        step = SECANT_STEP * (abs(value) or 1.0)
+        for end in (value + step, value - step):
+            try:
+                points[end] = function(self.put(experiment, end))
+            except (ExperimentError, UnconvergedError):
+                points[value] = function(experiment)
+        if len(points) < 2:
+            raise UnconvergedError(f"there is no prediction for {self.path} near {value:g}")
+        (first, above), (second, below) = points.items()
+        return (above - below) / (first - second)
+
     def _ends(
         self, experiment: Experiment, value: float, fraction: float, pairs: int
     ) -> tuple[float, list[tuple[Experiment, Experiment]]]:
@@ -191,3 +248,10 @@ class Parameter:
                         f"{self.path}: {value:.6g} is at its bound, so that it cannot be changed "
                         "in both directions; choose a number inside the bounds"
                     ) from None
+
+
+def _other_names(experiment: Experiment, part: str) -> Mapping[str, str]:
+    """Return the names of the parameters of a part by their other names."""
+    component = getattr(experiment, part, None)
+    names: Mapping[str, str] = getattr(component, "other_names", {})
+    return names

@@ -15,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ from pbdkit.fitting.parameter import Parameter
 from pbdkit.fitting.residual_pattern import remedy_of
 from pbdkit.fitting.sensitivity import scene_like
 from pbdkit.model.experiment import Experiment
+from pbdkit.plugin.units import is_stress_or_force, number_with_unit
 from pbdkit.stepping.state import initial_state
 
 GAP_ITERATIONS = 3
@@ -55,11 +56,12 @@ def least_gap(
 ) -> Floats:
     """Return the parameters between bounds that minimise the equilibrium gap, (parameter,).
 
-    The middle of the bounds is returned if too few displacements are known.
+    The middle of the bounds is returned if too few displacements are known, or only those along one
+    axis.
     """
     middle, inset = (low + high) / 2.0, INSET * (high - low)
     values = middle
-    if len(field.evidence.points) < MIN_POINTS:
+    if len(field.evidence.points) < MIN_POINTS or len(field.evidence.axes) < field.scene.axes:
         return middle
     state = initial_state(field.scene)
     u = _on_particles(field)
@@ -124,11 +126,59 @@ The initial guess is then not the middle of the bounds.
 
 @dataclass(frozen=True)
 class Unknown:
-    """An unknown parameter and its bounds."""
+    """An unknown parameter and its bounds.
+
+    Parameters
+    ----------
+    parameter
+        The parameter.
+    low, high
+        Bounds.
+    unit
+        Unit of the bounds; empty if they are numbers of the experiment.
+    scale
+        Number of the experiment divided by the value in this unit.
+    modulus
+        Young's modulus in `units` if the number is the value divided by Young's modulus, else None.
+    """
 
     parameter: Parameter
     low: float
     high: float
+    unit: str = ""
+    scale: float = 1.0
+    modulus: float | None = None
+
+    @classmethod
+    def of(cls, path: str, bounds: tuple[Any, Any], experiment: Experiment) -> Unknown:
+        """Return the unknown at a path, with bounds that are numbers or texts with a unit.
+
+        Raises
+        ------
+        ExperimentError
+            If there is no such number in the experiment, or the unit is wrong.
+        """
+        parameter, (low, high) = Parameter(path), bounds
+        parameter.value_in(experiment)
+        if not isinstance(high, str):
+            return cls(parameter, low, high)
+        value, unit = number_with_unit(high)
+        scale = parameter.number(experiment, high) / value
+        modulus = None
+        if is_stress_or_force(unit) and experiment.units:
+            modulus = experiment.units.value("youngs_modulus")
+        return cls(parameter, number_with_unit(low)[0], value, unit, scale, modulus)
+
+    def number(self, value: float, modulus: float | None = None) -> float:
+        """Return the number of the experiment for a value and, if it is unknown, the modulus."""
+        number = self.scale * float(value)
+        return (
+            number if modulus is None or self.modulus is None else number * self.modulus / modulus
+        )
+
+    def put(self, experiment: Experiment, value: float, modulus: float | None = None) -> Experiment:
+        """Return the experiment with a value. Raises ExperimentError if it is invalid."""
+        return self.parameter.put(experiment, self.number(value, modulus))
 
     @property
     def span(self) -> float:
@@ -159,12 +209,15 @@ class Linearisation:
         Derivatives of the predictions, divided by the weighted noise.
     predictions
         Prediction of each observation.
+    scales
+        Whether numbers of the experiment depend on an unknown Young's modulus.
     """
 
     z: Floats
     residuals: Floats
     jacobian: Floats
     predictions: tuple[Prediction, ...]
+    scales: bool = False
 
     @property
     def is_exact(self) -> bool:
@@ -174,7 +227,7 @@ class Linearisation:
     @property
     def is_linear(self) -> bool:
         """Return whether residuals are linear in all unknowns except the parameters."""
-        return all(prediction.is_linear for prediction in self.predictions)
+        return not self.scales and all(prediction.is_linear for prediction in self.predictions)
 
 
 @dataclass(frozen=True)
@@ -199,6 +252,11 @@ class Problem:
     def with_modulus(self) -> bool:
         """Return whether Young's modulus is unknown."""
         return any(observation.needs_modulus for observation in self.observations)
+
+    @cached_property
+    def is_smooth(self) -> bool:
+        """Return whether all predictions are smooth functions of the parameters."""
+        return all(observation.is_smooth for observation in self.observations)
 
     @cached_property
     def shared(self) -> int:
@@ -234,16 +292,19 @@ class Problem:
         z[:count] = (low + high) / 2.0
         fields = [item for item in self.observations if isinstance(item, FieldObservation)]
         parameters = [u.parameter for u in self.unknowns]
+        scale = np.array([u.scale for u in self.unknowns])
         is_wide = [unknown.is_wide for unknown in self.unknowns]
         if fields and any(is_wide):
-            guess = least_gap(fields[0], parameters, low, high)
+            guess = least_gap(fields[0], parameters, scale * low, scale * high) / scale
             z[:count] = np.where(is_wide, guess, z[:count])
+        if self.with_modulus:
+            z[count] = next((u.modulus for u in self.unknowns if u.modulus), 1.0)
         try:
             for observation in self.observations:
                 self.experiment_at(observation, z)
         except ExperimentError:
             experiment, inset = self.observations[0].experiment, INSET * (high - low)
-            values = [parameter.value_in(experiment) for parameter in parameters]
+            values = [parameter.value_in(experiment) for parameter in parameters] / scale
             z[:count] = np.clip(values, low + inset, high - inset)
         for observation, section in self.own_slices():
             z[section] = observation.start()
@@ -287,10 +348,14 @@ class Problem:
 
     def experiment_at(self, observation: Observation, z: Floats) -> Experiment:
         """Return the experiment of an observation with values of the parameters."""
-        experiment = observation.experiment
+        experiment, modulus = observation.experiment, self._modulus(z)
         for unknown, value in zip(self.unknowns, z, strict=False):
-            experiment = unknown.parameter.put(experiment, float(value))
+            experiment = unknown.put(experiment, value, modulus)
         return experiment
+
+    def _modulus(self, z: Floats) -> float | None:
+        """Return Young's modulus at z, or None if it is not unknown."""
+        return float(z[len(self.unknowns)]) if self.with_modulus else None
 
     def at(
         self, z: Floats, near: Linearisation | None = None, *, is_exact: bool = False
@@ -326,7 +391,27 @@ class Problem:
             jacobian[rows, section] = prediction.by_own
             if self.with_modulus:
                 jacobian[rows, len(parameters)] = prediction.by_modulus
-        return Linearisation(z, residuals, jacobian, tuple(predictions))
+        self._in_units(jacobian, z)
+        return Linearisation(z, residuals, jacobian, tuple(predictions), self._scales)
+
+    @cached_property
+    def _scales(self) -> bool:
+        """Return whether numbers of the experiment depend on an unknown Young's modulus."""
+        return self.with_modulus and any(u.modulus is not None for u in self.unknowns)
+
+    def _in_units(self, jacobian: Floats, z: Floats) -> None:
+        """Convert derivatives with respect to numbers of the experiment to those with respect to
+        values in units, in place.
+
+        If such a value is a stress or a force, the number of the experiment is its quotient by
+        Young's modulus, so that it changes with an unknown modulus too.
+        """
+        modulus, count = self._modulus(z), len(self.unknowns)
+        for n, unknown in enumerate(self.unknowns):
+            if unknown.unit:
+                jacobian[:, n] *= unknown.number(1.0, modulus)
+                if modulus is not None and unknown.modulus is not None:
+                    jacobian[:, count] -= z[n] / modulus * jacobian[:, n]
 
     def residuals(self, z: Floats) -> Floats:
         """Return the residuals at z. Raises the same errors as `at`."""
@@ -348,6 +433,8 @@ class Problem:
             abs(z[n] - at.z[n]) / min(u.span, u.scale_at(at.z[n]))
             for n, u in enumerate(self.unknowns)
         ]
+        if self._scales:
+            distances.append(abs(z[len(self.unknowns)] / at.z[len(self.unknowns)] - 1.0))
         away = np.inf if is_exact else float(max(distances, default=0.0))
         return [NearbyPrediction(prediction, away) for prediction in at.predictions]
 
@@ -366,6 +453,8 @@ AT_BOUND = 1e-6
 MAX_ITERATIONS = 50
 """Maximum number of Gauss-Newton iterations."""
 
+MAX_ITERATIONS_SECANT = 15
+"""The same for predictions that are not smooth."""
 MIN_RADIUS = 1e-5
 """Smallest radius of the trust region, relative to the scale of each parameter."""
 MIN_GAIN = 0.1
@@ -409,6 +498,17 @@ MODULUS = "Young's modulus"
 """Name of Young's modulus."""
 CONVERGED = 1e-2
 """Largest step, in standard errors, of a converged fit."""
+CONVERGED_SECANT = 0.15
+"""The same for predictions that are not smooth."""
+STALLED_SECANT = 0.5
+"""The same as `STALLED` for predictions that are not smooth. Their derivatives are averages over a
+range of about this size."""
+KINK = 0.5
+"""Increase of the cost that is accepted for predictions that are not smooth, in units of the mean
+square residual. The cost has local minima of about this depth, and the fit is where the projection
+of the residuals on the derivatives vanishes, which are averages."""
+MIN_RADIUS_SECANT = 2e-3
+"""The same as `MIN_RADIUS` for predictions that are not smooth."""
 FROZEN = 1e-3
 """Change of all residuals between the bounds below which an unknown is fixed.
 
@@ -579,15 +679,19 @@ def solved(problem: Problem, start: Floats, loss: Loss = "linear") -> Solution:
     z = np.clip(start, low, high)
     region = _Region(problem, loss, np.full(len(z), np.inf))
     at = region.linearise(z, None)
-    for _ in range(MAX_ITERATIONS):
+    for _ in range(MAX_ITERATIONS if problem.is_smooth else MAX_ITERATIONS_SECANT):
         step = _linear_step(at, low - at.z, high - at.z, loss)
         directions, unidentified = _identify_directions(problem, at, loss)
         remaining = np.abs(directions.errors(step)).max(initial=0.0)
-        trial = region.search(at) if remaining > CONVERGED else None
+        trial: Linearisation | None = None
+        if remaining > (CONVERGED if problem.is_smooth else CONVERGED_SECANT):
+            trial = region.search(at)
+        elif not (at.is_exact or problem.is_smooth):
+            trial = region.relinearise(at)
         if trial is None:
             break
         at = trial
-    if remaining > STALLED:
+    if remaining > (STALLED if problem.is_smooth else STALLED_SECANT):
         raise UnconvergedError(region.explain(at))
     ratio = spread_of(at.residuals, problem.size, loss)
     on_bounds = _on_bounds(problem, at.z)
@@ -623,7 +727,11 @@ class _Region:
         """Return the linearisation after a step that reduces the cost, or None if there is none."""
         (low, high), count = self.problem.bounds(), len(self.problem.unknowns)
         cost = cost_of(at.residuals, self.loss)
-        while self.radius >= MIN_RADIUS:
+        slack = SLACK * cost
+        if not self.problem.is_smooth:
+            slack += KINK * cost / max(1, len(at.residuals) - self.problem.size)
+        smallest = MIN_RADIUS if self.problem.is_smooth else MIN_RADIUS_SECANT
+        while self.radius >= smallest:
             sides = self._sides(at.z)
             step = _linear_step(
                 at, np.maximum(low - at.z, -sides), np.minimum(high - at.z, sides), self.loss
@@ -632,14 +740,13 @@ class _Region:
             share = np.abs(step[:count] / sides[:count]).max(initial=0.0)
             trial = self._try(at, step)
             decrease = cost - cost_of(trial.residuals, self.loss) if trial else -np.inf
-            if trial and decrease >= MIN_GAIN * gain - SLACK * cost:
+            if trial and decrease >= MIN_GAIN * gain - slack:
                 if decrease >= GOOD_GAIN * gain:
                     self.radius = max(self.radius, 2.0 * share * self.radius)
                     self.others = np.full(len(step), np.inf)
                 return trial
             if not at.is_exact:
-                at = self.problem.at(at.z, at, is_exact=True)
-                self.evaluations += 1
+                at = self.relinearise(at)
                 continue
             self.radius *= share / 4.0 if share else 0.25
             if not at.is_linear:
@@ -661,6 +768,11 @@ class _Region:
             return at
         self.evaluations += 1
         return self.problem.at(z + step, at)
+
+    def relinearise(self, at: Linearisation) -> Linearisation:
+        """Return the linearisation at the same values, with derivatives at these values."""
+        self.evaluations += 1
+        return self.problem.at(at.z, at, is_exact=True)
 
     def _sides(self, z: Floats) -> Floats:
         sides = self.others.copy()
@@ -759,6 +871,14 @@ def _singular(columns: Floats) -> tuple[Floats, Floats, Floats]:
     left_vectors, sizes, vectors = np.linalg.svd(triangle, full_matrices=False)
     is_regular = sizes > RANK * sizes.max(initial=0.0)
     return basis @ left_vectors[:, is_regular], sizes[is_regular], vectors[is_regular]
+
+
+def hat_diagonal(jacobian: Floats) -> Floats:
+    """Return the diagonal of the hat matrix, (residual,): the number of unknowns that each value
+    determines. Their sum is the number of independent unknowns."""
+    size = np.linalg.norm(jacobian, axis=0)
+    basis, _, _ = _singular(jacobian / np.where(size > 0.0, size, 1.0))
+    return np.asarray(np.square(basis).sum(axis=1))
 
 
 def _weight(residuals: Floats, loss: Loss) -> Floats:

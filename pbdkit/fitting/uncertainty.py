@@ -166,7 +166,7 @@ def reaction_along(force: Force, problem: Problem, solution: Solution) -> tuple[
     reaction = GroupReaction(prediction.resting_scene, force.group)
     unit, gradient = float(direction @ reaction.predicted), np.zeros(problem.size)
     for n, (du, unknown) in enumerate(zip(prediction.changes, problem.unknowns, strict=True)):
-        gradient[n] = direction @ reaction.change(du, unknown.parameter)
+        gradient[n] = unknown.scale * (direction @ reaction.change(du, unknown.parameter))
     reaction = GroupReaction(
         prediction.answering, force.group
     )  # The responses to boundary modes are those at this state.
@@ -463,9 +463,9 @@ def _fit_at(
     problem: Problem, n: int, value: float, start: Floats, loss: Loss
 ) -> tuple[float, Floats]:
     """Return the smallest cost for a fixed value of parameter n, and the z with this cost."""
-    parameter = problem.unknowns[n].parameter
+    unknown = problem.unknowns[n]
     observations = tuple(
-        replace(observation, experiment=parameter.put(observation.experiment, value))
+        replace(observation, experiment=unknown.put(observation.experiment, value))
         for observation in problem.observations
     )
     reduced = Problem((*problem.unknowns[:n], *problem.unknowns[n + 1 :]), observations)
@@ -568,7 +568,7 @@ def _marginal(problem: Problem, z: Floats, values: Floats, size: float) -> float
     for observation in problem.observations:
         experiment = observation.experiment
         for unknown, value in zip(problem.unknowns, values, strict=True):
-            experiment = unknown.parameter.put(experiment, float(value))
+            experiment = unknown.put(experiment, float(value))
         observations.append(replace(observation, experiment=experiment))
     rest = Problem((), tuple(observations))
     try:

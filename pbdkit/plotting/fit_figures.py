@@ -10,6 +10,7 @@ import numpy as np
 
 from pbdkit.array_types import Floats
 from pbdkit.errors import refuse_no_matplotlib
+from pbdkit.fitting.observations import CurveObservation
 from pbdkit.plugin.units import LENGTH
 
 if TYPE_CHECKING:
@@ -105,7 +106,10 @@ def _is_wide(fitted: Fitted, n: int) -> bool:
 def _field_size(fitted: Fitted, n: int, count: int) -> tuple[float, float]:
     wide, tall = np.ptp(fitted.field(n).points, axis=0)
     height = min(max(PANEL_IN * float(tall / wide), 0.8), 5.0) + MARGIN_IN
-    return (2 * PANEL_IN, count * height) if wide > tall else (count * PANEL_IN, 2 * height)
+    components = len(fitted.field(n).components)
+    if wide > tall:
+        return components * PANEL_IN, count * height
+    return count * PANEL_IN, components * height
 
 
 def _curve_size(count: int) -> tuple[float, float]:
@@ -119,11 +123,12 @@ def _draw_field(figure: SubFigure, fitted: Fitted, n: int) -> None:
     factor, unit = fitted.misfits[n].factor, fitted.misfits[n].unit
     counted = f" ({unit})" if unit else ""
     wide, count = _is_wide(fitted, n), 3 + len(information)
-    shape = (count, 2) if wide else (2, count)
-    axes = figure.subplots(*shape, sharex=True, sharey=True)
+    components = field.components
+    shape = (count, len(components)) if wide else (len(components), count)
+    axes = figure.subplots(*shape, sharex=True, sharey=True, squeeze=False)
     area = float(np.prod(np.ptp(field.points, axis=0)) / np.ptp(field.points, axis=0)[0] ** 2)
     size = max(0.5, 0.55 * 72 * PANEL_IN * np.sqrt(area / len(field.points)))
-    for column, name in enumerate(("ux", "uy")):
+    for column, name in enumerate(components):
         measured, residual = factor * field.measured[:, column], factor * field.residual[:, column]
         panels = [
             (f"{name} measured{counted}", measured, (measured.min(), measured.max()), "viridis"),
@@ -141,7 +146,7 @@ def _draw_field(figure: SubFigure, fitted: Fitted, n: int) -> None:
             ),
         ]
         for path, sensitivity in information.items():
-            share = sensitivity.reshape(2, -1)[column] / largest
+            share = sensitivity.reshape(len(components), -1)[column] / largest
             panels.append((f"{name} sensitivity to {path}", share, (0.0, 1.0), "magma_r"))
         column_axes = axes[:, column] if wide else axes[column]
         for ax, (title, values, limits, colours) in zip(column_axes, panels, strict=True):
@@ -189,13 +194,14 @@ def _in_units(fitted: Fitted, n: int) -> tuple[float, Floats, str, str]:
     the labels of the values and of the abscissa. They are in the units of the experiment if it has
     units."""
     numbers, observed = fitted.numbers(n), fitted.misfits[n]
-    units = fitted.problem.observations[n].experiment.units
+    observation = fitted.problem.observations[n]
+    units, along, over = observation.experiment.units, numbers.along, numbers.over
     if units is None:
-        return 1.0, numbers.along, numbers.what, numbers.over
-    over_time = numbers.over.startswith("time")
-    along = numbers.along if over_time else units.length_mm * numbers.along
-    over = numbers.over if over_time else f"{numbers.over} ({LENGTH.unit})"
-    return observed.factor, along, f"{numbers.what} ({observed.unit})", over
+        return 1.0, along, numbers.what, over
+    if isinstance(observation, CurveObservation) and observation.over.quantity is LENGTH:
+        along, over = units.length_mm * along, f"{over} ({LENGTH.unit})"
+    what = f"{numbers.what} ({observed.unit})" if observed.unit else numbers.what
+    return observed.factor, along, what, over
 
 
 def _line(joined: bool) -> dict[str, Any]:

@@ -344,6 +344,26 @@ def is_unit(name: str) -> bool:
     return True
 
 
+def number_with_unit(text: str) -> tuple[float, str]:
+    """Return the number and the unit of a text.
+
+    Raises
+    ------
+    ValueError
+        If the text is not a number with a unit.
+    """
+    match = TEXT.fullmatch(text)
+    if match is None:
+        raise ValueError(f"{text!r} is not a number with a unit")
+    return float(match.group(1)), match.group(2)
+
+
+def is_stress_or_force(unit: str) -> bool:
+    """Return whether numbers with a unit are divided by Young's modulus in lattice units. Lengths,
+    areas and numbers per length are not."""
+    return not any(_is_of(f"1 {unit}", q.unit) for q in (LENGTH, AREA, PER_LENGTH))
+
+
 def _is_of(text: str, unit: str) -> bool:
     """Return whether a text is a number with a unit of the same dimension as `unit`."""
     try:

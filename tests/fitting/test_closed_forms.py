@@ -78,7 +78,7 @@ def test_derivatives_of_smooth_functions_need_few_values() -> None:
 def test_bounds_are_tested_just_inside(low: float, high: float) -> None:
     values = []
     parameter = SimpleNamespace(put=lambda _, value: values.append(value), path="rule.x")
-    fit._refuse_beyond(SimpleNamespace(low=low, high=high, parameter=parameter), None)
+    fit._refuse_beyond(problem.Unknown(parameter, low, high), None)
     assert low < min(values) < low + 1e-5 * (high - low)
     assert high > max(values) > high - 1e-5 * (high - low)
 

@@ -314,7 +314,7 @@ def test_rows_beyond_the_end_of_a_curve_are_named(measured, tmp_path):
     given = curve(measured, file=str(tmp_path / "curve.csv"))
     found = pbdkit.fit({"experiment": bar(), "unknown": unknown, "measured": given})
     within(found)
-    said = "2 rows are omitted: the run's displacements of the group go from 0 to 0.2"
+    said = "2 rows are omitted: in the run, the displacement of group 1 goes from 0 to 0.2"
     assert any(line.endswith(said) for line in str(found).splitlines())
     assert found.as_dict()["measured"][0]["left_out_because"] in said
 
@@ -376,7 +376,7 @@ WRONG = {
     "a curve beyond the run": (
         lambda f: curve(f, file="force.csv", columns=["time", "force"], against="time"),
         {"steps": 12},
-        "curve goes from 0 to 16, but the run's times go from 0 to 12",
+        "curve goes from 0 to 16, but in the run, the time .step. goes from 0 to 12",
     ),
     "no such group": (lambda f: curve(f, group=5), {}, "no leader group 5"),
     "does not move": (lambda f: curve(f, group=0), {}, "against: time"),
