@@ -26,8 +26,10 @@ ROOT = Path(__file__).parent.parent
 EXTENDING = ROOT / "docs" / "extending"
 PARTS = (ROOT / "docs").rglob("*.md")
 NOTEBOOKS = sorted(p for p in PARTS if "\nfile_format: mystnb\n" in p.read_text())
-SHORT_NOTEBOOKS = [p for p in NOTEBOOKS if AT_LENGTH or p.stem not in ("fit-fields", "crack-field")]
-"""Pages of commands fit full fields, too, so that these notebooks are run in the profile `long`."""
+LONG_NOTEBOOKS = ("fit-fields", "crack-field", "notched-beam")
+"""Pages that are run in the profile `long`. Pages of commands fit full fields, too, and
+`fitting/test_channels` fits softening curves."""
+SHORT_NOTEBOOKS = [p for p in NOTEBOOKS if AT_LENGTH or p.stem not in LONG_NOTEBOOKS]
 FOLDERS = [ROOT / "docs", EXTENDING, ROOT / "docs" / "reference", ROOT / "docs" / "validation"]
 PAGES = [ROOT / "README.md", *(page for folder in FOLDERS for page in sorted(folder.glob("*.md")))]
 
