@@ -382,11 +382,6 @@ WRONG = {
     "does not move": (lambda f: curve(f, group=0), {}, "against: time"),
     "another way": (lambda f: curve(f, axis="y", file="force.csv"), {}, "no 'displacement'"),
     "not the kind": (lambda f: curve(f) | {"type": "curves"}, {}, "did you mean 'curve'"),
-    "no noise": (
-        lambda f: [tracks(f), {k: v for k, v in curve(f).items() if k != "noise"}],
-        {},
-        "require the `noise` of each",
-    ),
 }
 
 
