@@ -36,6 +36,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache, partial
+from itertools import islice
 from pathlib import Path
 from types import CodeType, FunctionType
 from typing import Any, NamedTuple
@@ -116,6 +117,7 @@ TESTS = [
     "hard_cases",
     "mpi/test_partition.py",
     "mpi/test_driver.py",
+    "testing",
     "test_simulation.py",
     "test_random_scenes.py",
     "test_crossed_scenes.py",
@@ -284,16 +286,13 @@ def mutants_of(area: str, path: Path) -> dict[tuple[int, int], list[Mutant]]:
     names = [*OPERATORS, *(["KernelText"] if in_kernels else [])]
     operators = {name: _operator(name) for name in names}
     occurrences: Counter[str] = Counter()
-    source = path.read_text()
-    with_walrus = {n for n, text in enumerate(source.splitlines(), 1) if ":=" in text}
-    for node in ast_nodes(parso.parse(source)):
+    for node in ast_nodes(parso.parse(path.read_text())):
         relevant: bool | None = None
         for name, operator in operators.items():
             for start, _ in operator.mutation_positions(node):
                 if relevant is None:
                     relevant = _is_relevant(node, in_kernels)
-                is_python = name != "AddNot" or start[0] not in with_walrus
-                if relevant and is_python:
+                if relevant:
                     lines = _statement(node)
                     number = occurrences[name]
                     places[start].append(Mutant(area, relative, name, number, start[0], lines))
@@ -324,8 +323,17 @@ def drawn(count: int, seed: int, areas: Sequence[str]) -> list[Mutant]:
             places = mutants_of(area, path)
             ranked += zip(_order(seed, path, places), places.values(), strict=True)
         share = count // len(areas) + (number < count % len(areas))
-        mutants += [random.Random(n).choice(choices) for n, choices in sorted(ranked)[:share]]
+        chosen = (random.Random(n).choice(choices) for n, choices in sorted(ranked))
+        mutants += islice(filter(_is_python, chosen), share)
     return mutants
+
+
+def _is_python(mutant: Mutant) -> bool:
+    try:
+        compile(mutant.code(), mutant.path, "exec")
+    except SyntaxError:
+        return False
+    return True
 
 
 class Recording:
