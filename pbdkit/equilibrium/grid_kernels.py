@@ -60,7 +60,7 @@ def coarse_kinds(kind, halved, out):
     for n in range(1, out.shape[0] - 1):
         for m in range(1, out.shape[1] - 1):
             i, j = (2 * n - 1 if a1 else n), (2 * m - 1 if b1 else m)
-            place_kind = kind[i, j] if i < kind.shape[0] and j < kind.shape[1] else 0
+            place_kind = kind[i, j]
             for ring in (1, 2):
                 if place_kind:
                     break

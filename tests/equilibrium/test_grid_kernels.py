@@ -13,7 +13,7 @@ from scipy.ndimage import label
 
 from pbdkit.equilibrium import grid_kernels
 from pbdkit.equilibrium.multigrid import coarser_size
-from pbdkit.equilibrium.stencil_matrix import StencilMatrix
+from pbdkit.equilibrium.stencil_matrix import FREE, LED, OUTSIDE, StencilMatrix
 from tests.equilibrium.test_stencil_matrix import dense, random_matrix
 
 HALVED = [(1, 1), (1, 0), (0, 1)]
@@ -144,6 +144,29 @@ def beside_body(kind: Any, fine: Any, halved: Any) -> Any:
     return result
 
 
+@pytest.mark.parametrize("halved", HALVED, ids=str)
+@pytest.mark.parametrize("seed", range(3))
+def test_coarse_places_have_the_kind_of_the_nearest_places(
+    kernels: Any, halved: Any, seed: int
+) -> None:
+    """Among the places of which values are interpolated from a coarse place; if a free place and a
+    leader are equally near, the coarse place is free."""
+    kind = random_matrix(seed, 0.6).kind
+    shape = [coarser_size(n) if half else n for n, half in zip(kind.shape, halved, strict=True)]
+    out = np.zeros(shape, np.int8)
+    kernels.coarse_kinds(kind, halved, out)
+    body = np.argwhere(kind != OUTSIDE)
+    for n, m in np.argwhere(np.pad(np.ones(np.array(shape) - 2), 1)):
+        at = np.where(halved, 2 * np.array([n, m]) - 1, [n, m])
+        away = np.abs(body - at)
+        near = (away <= halved).all(axis=1)
+        kinds = kind[tuple(body[near].T)]
+        distance = away[near].sum(axis=1)
+        nearest = kinds[distance == distance.min(initial=9)]
+        expected = OUTSIDE if not len(nearest) else FREE if FREE in nearest else LED
+        assert out[n, m] == expected
+
+
 def test_uniform_bodies_keep_one_stencil(kernels: Any) -> None:
     """The next grid has the most frequent stencil where all stencils around a place have it."""
     code = np.full((14, 14), -1, np.int32)
@@ -201,6 +224,20 @@ def test_asymmetry_symmetric_part_and_balance(kernels: Any, seed: int) -> None:
     parts, _ = label(matrix.code >= 0, np.ones((3, 3)))
     np.testing.assert_array_equal(found, parts == parts[known])
     np.testing.assert_allclose(factor[found], share[found], rtol=1e-10)
+
+
+def test_asymmetry_of_the_most_frequent_stencil_is_found_beside_other_stencils(
+    kernels: Any,
+) -> None:
+    """Entries differ between places with the most frequent stencil only."""
+    code = np.full((8, 8), -1, np.int32)
+    code[1:-1, 1:-1] = 0
+    code[2, 2] = code[1, 2] = 1
+    stencils = np.ones((2, 9, 4))
+    stencils[0, 8, 1] = stencils[1, 0, 2] = 1.3
+    matrix = StencilMatrix(code, (code >= 0).astype(np.int8), stencils, stencils[:, 4], None, None)
+    assert abs(dense(matrix) - dense(matrix).T).max() == pytest.approx(0.3)
+    assert kernels.asymmetry(code, stencils) == pytest.approx(0.3)
 
 
 def test_vector_operations(kernels: Any) -> None:

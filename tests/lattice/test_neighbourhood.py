@@ -1,6 +1,7 @@
 """Neighbourhoods of every lattice and metric: shells, opposite pairs, mutuality."""
 
 import math
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -167,6 +168,21 @@ class OnTheCorner(pbdkit.Lattice):
             period=(2, 1),
             primitive=((2, 0), (0, 1)),
         )
+
+
+class Twice(OnTheCorner):
+    """Two sites with one index."""
+
+    type: Literal["twice"] = "twice"
+
+    def cell(self):
+        cell = super().cell()
+        return replace(cell, sites=(cell.sites[0], replace(cell.sites[1], index=(0, 0))))
+
+
+def test_sites_of_a_cell_have_indices_of_their_own():
+    with pytest.raises(pbdkit.ExperimentError, match="these must differ and lie within the"):
+        scene_of(lattice=Twice())
 
 
 def test_asymmetric_neighbourhoods_are_refused():
