@@ -112,19 +112,18 @@ class StrainGauge(Gauge):
     def _displacement(self, now: Moment, point: Floats) -> Floats:
         """Return the displacement at a point, interpolated in its cell, (axis,)."""
         place = (float(point[0]), float(point[1]))
-        nearest = now.reference(now.nearest((place,)))[0]
-        size = self.length + float(np.abs(point - nearest).max())
-        for table in now.cells.table((place, size)):
-            weights = _weights(now.reference(table.corners.ravel()), table.corners.shape, point)
-            inside = np.flatnonzero((weights >= -ON_EDGE).all(axis=1))
-            if inside.size:
-                row: Indices = table.corners[inside[0]]
-                result: Floats = weights[inside[0]] @ now.displacement(row)
-                return result
+        # The cells nearby are searched first, then all cells, for a gauge shorter than a cell.
+        for distance in (self.length, np.inf):
+            for table in now.cells.table((place, distance)):
+                weights = _weights(now.reference(table.corners.ravel()), table.corners.shape, point)
+                inside = np.flatnonzero((weights >= -ON_EDGE).all(axis=1))
+                if inside.size:
+                    row: Indices = table.corners[inside[0]]
+                    result: Floats = weights[inside[0]] @ now.displacement(row)
+                    return result
         x, y = place
         raise ExperimentError(
-            f"the end ({x:g}, {y:g}) of the strain gauge is not in a cell of the body; move the "
-            "gauge or, if it is shorter than a cell, make it longer",
+            f"the end ({x:g}, {y:g}) of the strain gauge is not in a cell of the body; move it",
             ("at",),
         )
 

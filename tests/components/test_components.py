@@ -44,6 +44,8 @@ REQUIRED = {
     "length": 0.1,
     "youngs_modulus": 7.0,
     "width": 2.0,
+    "between": [[0.0, 0.0], [2.0, 1.0]],
+    "at": [1.6, 1.2],
 }
 
 
