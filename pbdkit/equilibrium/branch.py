@@ -43,6 +43,7 @@ from pbdkit.lattice.raster import FOLLOWER
 from pbdkit.linear.operator import Guiding
 from pbdkit.model.solver import DissipationControl, OpeningControl
 from pbdkit.plugin import RenewsBonds, SoftensCells
+from pbdkit.plugin.units import in_lengths
 from pbdkit.progress import Watch
 from pbdkit.scene.constants import bond_numbers
 from pbdkit.scene.leader_groups import guided_at, kinds_at
@@ -648,7 +649,7 @@ def follow(
             if part >= SMALLEST_PART and not isinstance(error, SplitError):
                 continue
             if branch.softness(state) < SEPARATED:
-                raise SeparatedError(_parted(state, since)) from None
+                raise SeparatedError(_parted(scene, state, since)) from None
             text = _where(state, since, moment, error, branch.smallest)
             raise type(error)(text, error_bound) from None
         reached.step = math.floor(moment)
@@ -668,12 +669,25 @@ def _target(scene: Scene, moment: float) -> Target | None:
     return Target(control.to * ((moment - 1.0) / (steps - 1))) if moment > 1.0 else None
 
 
-def _parted(state: State, moment: float) -> str:
+def _parted(scene: Scene, state: State, moment: float) -> str:
     """Return the message for a body that has come apart."""
+    experiment = scene.experiment
+    control, target = experiment.solver.equilibrium.control, _target(scene, moment)
+    length, unit = in_lengths(experiment.units)
+    where, remedy = "", "use fewer steps"
+    if target is not None and isinstance(control, OpeningControl):
+        value = f"{length * target.value:.4g}"
+        where = f" and the opening {value} of {length * control.to:.4g} {unit}"
+        remedy = f"set solver.control.to to {value} {unit}"
+    elif target is not None and isinstance(control, DissipationControl):
+        share = target.value / control.to
+        where = f" and {100.0 * share:.4g} % of the dissipated energy `to`"
+        remedy = f"multiply solver.control.to by {share:.4g}"
     return (
         f"the body has come apart after step {moment:.6g}, at the load factor "
-        f"{state.load_factor:.6g}: its parts are held together with less than {SEPARATED:g} of the "
-        "stiffness at the start"
+        f"{state.load_factor:.6g}{where}: its parts are held together with less than {SEPARATED:g} "
+        "of the stiffness at the start; the records up to there are valid; to end the run there, "
+        f"{remedy}"
     )
 
 

@@ -211,7 +211,7 @@ def optional_columns() -> list[list[Column]]:
                 When.RECORD,
                 "dissipated energy",
                 AREA.lattice,
-                comment="divided by Young's modulus and thickness",
+                comment="in lattice units it is divided by Young's modulus and thickness",
             ),
         ],
         [Column("opening", ("time",), "f8", When.RECORD, "opening", LENGTH.lattice)],

@@ -12,7 +12,7 @@ import numpy as np
 from pbdkit.errors import PluginError
 from pbdkit.io.layout import STEP, Column, Values
 from pbdkit.plugin import Diagnostic, Variable
-from pbdkit.plugin.units import LENGTH, QUANTITIES, Quantity, Units, given_by_units
+from pbdkit.plugin.units import ENERGY, LENGTH, QUANTITIES, Quantity, Units, given_by_units
 
 if TYPE_CHECKING:
     import xarray
@@ -29,6 +29,10 @@ FACTOR = "physical_factor"
 unit."""
 TWIN_OF = "physical_of"
 """Attribute of a converted copy that contains the name of the original variable."""
+
+
+DIVIDED = {"dissipated_energy": ENERGY}
+"""Quantities of the variables that are divided by Young's modulus and the thickness."""
 
 
 class Physical:
@@ -83,6 +87,9 @@ class Physical:
             if quantity is None or quantity.youngs_modulus:
                 continue
             scales = {UNITS: quantity.unit, FACTOR: scale**quantity.length}
+            whole = DIVIDED.get(column.name, quantity)
+            if whole is not quantity and not self._units.missing_entries(whole):
+                scales = {UNITS: whole.unit, FACTOR: self._units.scale(whole)}
             entries[n] = replace(column, extra=column.extra | scales)
             if quantity is LENGTH and column.name != "position":
                 twin = f"{column.name}{IN_MM}"

@@ -66,31 +66,26 @@ from pbdkit.stepping.rule_evaluation import Evaluator, Neighbour, Surroundings, 
 from pbdkit.stepping.state import State, describe_bonds
 
 
-def lost_stress(scene: Scene, state: State, u: Floats, cells: list[tuple[Patch, Floats]]) -> Floats:
-    """Return the part of the first Piola-Kirchhoff stress that is lost because of damage, divided
-    by Young's modulus, (component × axis, sublattice, cell, cell). At each particle it is the mean
-    over the given cells around it, weighted by their area fractions.
+def lost_stress(
+    scene: Scene, state: State, u: Floats, cells: list[tuple[Patch, Floats]]
+) -> list[Floats]:
+    """Return the part of the first Piola-Kirchhoff stress that is lost in each cell because of
+    damage, divided by Young's modulus and multiplied by the area of the cell in the body.
 
-    In a cell it is -Σ ΔF ⊗ X over its corners, divided by its area, where ΔF is the change of the
-    force on a corner because of damage. This is the formula for the mean stress of a body with
-    forces on its surface.
+    It is an array (component × axis, cell, cell) for each patch, -Σ ΔF ⊗ X over the corners of a
+    cell, where ΔF is the change of the force on a corner because of damage. This is the formula for
+    the mean stress of a body with forces on its surface.
     """
-    total, area = np.zeros((4, *scene.raster.shape)), np.zeros(scene.raster.shape)
+    result: list[Floats] = []
     for patch, share in cells:
         used = np.flatnonzero(np.broadcast_to(share, patch.whole.shape) > 0.0)
-        corners = [_places(scene, patch, n, used) for n in range(len(patch.corners))]
-        weight = np.broadcast_to(share, patch.whole.shape).ravel()[used]
-        size = abs(float(signed_area(patch.polygon.rest)))
-        lost = np.zeros((4, len(used)))
-        for n, (place, rest) in enumerate(zip(corners, patch.polygon.rest, strict=True)):
+        lost = np.zeros((4, patch.whole.size))
+        for n, rest in enumerate(patch.polygon.rest):
+            place = _places(scene, patch, n, used)
             for force in _lost_forces(scene, state, u, patch, n, place):
-                lost += np.array([f * x for f in force for x in rest]) / size
-        for place in corners:
-            flat = place.place
-            np.add.at(area.reshape(-1), flat, weight)
-            for plane, value in zip(total.reshape(4, -1), lost, strict=True):
-                np.add.at(plane, flat, value)
-    return total / np.where(area > 0.0, area, 1.0)
+                lost[:, used] += np.array([f * x for f in force for x in rest])
+        result.append(lost.reshape(4, *patch.whole.shape))
+    return result
 
 
 def _places(scene: Scene, patch: Patch, corner: int, cells: NDArray[np.intp]) -> Places:
@@ -279,6 +274,8 @@ class Tables:
         return blocks(self.scene)
 
 
+Average = Callable[[list[tuple[Patch, Floats]]], Floats]
+"""Function that computes a tensor at the particles from cells with their area fractions."""
 FLAT = 0.1
 """Each corner of a cell is moved to the mean of the centres of the cells around it. If the area of
 the cell is then smaller than this fraction of its area at rest, these points are nearly collinear
@@ -289,23 +286,45 @@ def displacement_gradient(u: NDArray[Any], cells: Iterable[tuple[Patch, Floats]]
     """Return ∂u_a/∂X_b, (2a + b, sublattice, cell, cell), from the displacements u on rasters, and
     the cells with their area fractions. The result is 0 at places without cells."""
     cells = list(cells)
-    shape = u.shape[1:]
-    area, offset, gradient = np.zeros(shape), np.zeros((2, *shape)), np.zeros((2, 2, *shape))
-    for patch, share in cells:
-        rest = patch.polygon.rest
-        whole, slopes = _mean_gradient([np.array(d) for d in patch.differences(u)], rest)
+    slopes = (
+        _mean_gradient([np.array(d) for d in patch.differences(u)], patch.polygon.rest)[1] * share
+        for patch, share in cells
+    )
+    return average_at_particles(u.shape[1:], cells, slopes)
+
+
+def average_at_particles(
+    shape: tuple[int, ...], cells: list[tuple[Patch, Floats]], weighted: Iterable[Floats]
+) -> Floats:
+    """Return the values of cells at the particles, (component, sublattice, cell, cell).
+
+    They are the means over the cells around a particle. If the centre of these cells is not at the
+    particle, as at an edge, the means are extrapolated linearly from there.
+
+    Parameters
+    ----------
+    shape
+        Shape of the rasters.
+    cells
+        Cells with their area fractions.
+    weighted
+        Four values of the cells of each patch, multiplied by their area in the body.
+    """
+    area, offset, total = np.zeros(shape), np.zeros((2, *shape)), np.zeros((4, *shape))
+    for (patch, share), values in zip(cells, weighted, strict=True):
+        rest, whole = patch.polygon.rest, signed_area(patch.polygon.rest)
         centre = [sum(r[axis] for r in rest) / len(rest) for axis in (0, 1)]
         for corner, r in zip(patch.corners, rest, strict=True):
             corner.of(area)[...] += whole * share
             for plane, middle, place in zip(offset, centre, r, strict=True):
                 corner.of(plane)[...] += (middle - place) * whole * share
-            for plane, slope in zip(gradient, slopes, strict=True):
-                corner.of(plane)[...] += slope * share
+            parts = values.reshape(4, *values.shape[-len(patch.whole.shape) :])
+            for plane, value in zip(total, parts, strict=True):
+                corner.of(plane)[...] += value
     divisor = np.where(area > 0.0, area, 1.0)
-    gradient /= divisor
+    total /= divisor
     offset /= divisor
-    planes = gradient.reshape(4, *shape)
-    return planes - _extrapolation(planes, offset, cells)
+    return total - _extrapolation(total, offset, cells)
 
 
 def _extrapolation(gradient: Floats, offset: Floats, cells: list[tuple[Patch, Floats]]) -> Floats:
@@ -391,12 +410,17 @@ class StateCells(CellValues):
 
     @cached_property
     def _gradient(self) -> Floats:
-        weighed, u = self._scene.cells, self._state.u.astype(float, copy=False)
-        cells = self._weighed
-        whole = self._tables.of_body(displacement_gradient(u, cells))
+        u = self._state.u.astype(float, copy=False)
+        return read_only(self._at_particles(lambda cells: displacement_gradient(u, cells)))
+
+    def _at_particles(self, average: Average) -> Floats:
+        """Return a tensor at each particle, (particle, 2, 2), from the function that computes it at
+        particles from given cells."""
+        weighed, cells = self._scene.cells, self._weighed
+        whole = self._tables.of_body(average(cells))
         if weighed is not None and weighed.phase is not None:
-            whole = self._by_phase(weighed.phase, u, cells, whole)
-        return read_only(whole.reshape(-1, 2, 2))
+            whole = self._by_phase(weighed.phase, average, cells, whole)
+        return whole.reshape(-1, 2, 2)
 
     def table(self, near: tuple[Pair, float] | None = None) -> tuple[CellTable, ...]:
         """Return the cells near a point, or the torn cells. Only their entries are created."""
@@ -440,8 +464,13 @@ class StateCells(CellValues):
         if not (scene.tears and isinstance(scene.experiment.fracture, (Softens, SoftensCells))):
             return None
         u = state.u.astype(float, copy=False)
-        planes = lost_stress(scene, state, u, self._weighed)
-        return self._tables.of_body(planes).reshape(-1, 2, 2)
+        lost = lost_stress(scene, state, u, self._weighed)
+
+        def average(cells: list[tuple[Patch, Floats]]) -> Floats:
+            parts = (part * (share > 0.0) for part, (_, share) in zip(lost, cells, strict=True))
+            return average_at_particles(u.shape[1:], cells, parts)
+
+        return self._at_particles(average)
 
     @cached_property
     def _weighed(self) -> list[tuple[Patch, Floats]]:
@@ -453,18 +482,22 @@ class StateCells(CellValues):
         ]
 
     def _by_phase(
-        self, phase: NDArray[Any], u: Floats, cells: list[tuple[Patch, Floats]], whole: Floats
+        self,
+        phase: NDArray[Any],
+        average: Average,
+        cells: list[tuple[Patch, Floats]],
+        whole: Floats,
     ) -> Floats:
-        """Return the gradient at each particle. It is computed only from cells of the particle's
-        own material, because gradients are discontinuous at interfaces. If a particle has no such
-        cells, its gradient is the mean over neighbouring particles that have such cells."""
+        """Return the tensor at each particle. It is computed only from cells of the particle's own
+        material, because gradients are discontinuous at interfaces. If a particle has no such
+        cells, its tensor is the mean over neighbouring particles that have such cells."""
         gradient, phases = whole.copy(), self._tables.phase
         for number in np.unique(phases).tolist():
             phase_cells = [
                 (patch, share * (patch.corners[0].of(phase[patch.polygon.kind]) == number))
                 for patch, share in cells
             ]
-            planes = _extend_gradient(displacement_gradient(u, phase_cells), phase_cells, cells)
+            planes = _extend_gradient(average(phase_cells), phase_cells, cells)
             values = self._tables.of_body(planes)
             rows = (phases == number) & np.isfinite(values).all(axis=1)
             gradient[rows] = values[rows]

@@ -121,6 +121,20 @@ def test_snap_back_of_a_bar_is_that_of_springs_in_series(control):
         assert opening[1] == pytest.approx(ONSET, rel=1e-6)
 
 
+def test_stress_at_particles_is_that_which_softened_cells_transmit():
+    """The weak cells are those at the left end, where stress is extrapolated."""
+    bar = BAR | {
+        "body": {"type": "rectangle", "width": 4.0, "height": 2.0},
+        "regions": {"weak": BAR["regions"]["weak"] | {"origin": [0.05, -2.0]}},
+        "diagnostics": [*REACTIONS, {"type": "stress", "youngs_modulus": 1.0}],
+    }
+    ds = ran(bar, CELL | {"between": [[0, 0], [1, 0]]}, steps=2)
+    stress = ds.reaction.sel(leader_group=1, axis="x").values / 2.0
+    assert stress[-1] < 0.2 * ONSET
+    expected = np.broadcast_to(stress[:, None], ds.stress_xx.shape)
+    np.testing.assert_allclose(ds.stress_xx, expected, atol=1e-8 * ONSET)
+
+
 def test_branch_of_an_elastic_body_is_a_straight_line():
     elastic = {"fracture": {"type": "none"}, "steps": 3}
     by_load = ran(NOTCHED, **elastic)
@@ -282,7 +296,10 @@ def test_branch_ends_when_the_body_has_come_apart_or_the_opening_decreases():
     tough = {"fracture": NOTCHED["fracture"] | {"energy": 2e-5}}
     ds = ended(NOTCHED, MOUTH | {"to": 0.05}, steps=10, **pulled, **tough)
     assert ds.status == "separated"
-    assert "the body has come apart after step" in ds.stop_reason
+    end = ds.stop_reason.removeprefix("the body has come apart after step ")
+    assert re.match(r"\d+(\.\d+)?, at the load factor [\d.]+ and the opening [\d.]+ of 0.05 ", end)
+    to = float(re.search(r"records up to there .* set solver.control.to to ([\d.]+) ", end)[1])
+    assert float(ds.opening[-1]) <= to < float(ds.opening[-1]) + 0.05 / 10
     ds = ended(NOTCHED, MOUTH, steps=10, **pulled)
     assert ds.status == "unconverged"
     assert "the controlled quantity has its largest value on the branch" in ds.stop_reason

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 import pbdkit
-from pbdkit.io.layout import dataset_schema
+from pbdkit.io.layout import dataset_schema, optional_columns
 from pbdkit.io.netcdf import NetcdfSink
+from pbdkit.io.physical import Physical
 from pbdkit.model.reading import Source
 from pbdkit.model.schema import experiment_schema
 from pbdkit.plotting.style import in_its_units
@@ -146,6 +147,20 @@ def test_accessor_converts_all_variables_with_a_scale(bar: Any) -> None:
     np.testing.assert_array_equal(physical.reaction, bar.reaction)
     assert "u_mm" not in physical
     assert {*physical.coords} == {*bar.coords} - {"reference_mm", "X_mm", "Y_mm"}
+
+
+@pytest.mark.parametrize(
+    ("more", "unit", "factor"),
+    [({}, "mm^2", 4.0), ({"youngs_modulus": "3 MPa", "thickness": "5 mm"}, "mJ", 60.0)],
+)
+def test_dissipated_energy_is_converted_to_an_energy(
+    more: dict[str, str], unit: str, factor: float
+) -> None:
+    each = [column for group in optional_columns() for column in group]
+    (column,) = (column for column in each if column.name == "dissipated_energy")
+    (described,) = Physical(Units(length="2 mm", **more)).columns([column])
+    assert described.extra["physical_units"] == unit
+    assert described.extra["physical_factor"] == pytest.approx(factor)
 
 
 def test_units_of_a_converted_dataset_are_known_to_pint(bar: Any) -> None:
