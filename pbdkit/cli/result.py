@@ -90,15 +90,16 @@ def _run_in_words(facts: dict[str, Any]) -> Iterator[str]:
             f"end outside its outline, and {by_place['frame']} with an end in the frame"
         )
     rows = [status for status in facts["in_order"] if status.state == "broken"]
+    has_limits = any(status.breaks_above is not None for status in rows)
     if rows:
         yield f"first in step {rows[0].step}, last in step {rows[-1].step}"
-        yield "order  step  bond           strain       breaks above"
+        yield "order  step  bond           strain" + ("       breaks above" if has_limits else "")
     for status in rows[:MAX_LISTED]:
         strain, limit = _number(status.strain_at_break), _number(status.breaks_above)
         position = f"{status.order:>5}  {status.step:>4}  {_name(status):<13}"
         place = "" if status.place == "body" else f"  {status.place}"
-        yield f"{position}  {strain:<11}  {limit}{place}"
-    if rows and all(status.breaks_above is None for status in rows):
+        yield f"{position}  {strain:<11}" + (f"  {limit}" if has_limits else "") + place
+    if rows and not has_limits:
         remedy = "a fracture model declares it by `breaking_strain`"
         yield f"{model} declares no strain above which a bond breaks: {remedy}"
     if len(rows) > MAX_LISTED:

@@ -87,7 +87,7 @@ def choices(dataset: xarray.Dataset) -> str:
     for dim in map(str, dataset[STATUS].dims):
         words = [_word(value) for value in _labels(dataset, dim)[:MAX_SHOWN]]
         ellipsis = ", ..." if dataset.sizes[dim] > MAX_SHOWN else ""
-        parts.append(f"{dim}: {', '.join(words)}{ellipsis}{_unit_of(dataset, dim)}")
+        parts.append(f"{dim}: {', '.join(words)}{ellipsis}{_after_space(unit_of(dataset, dim))}")
     return "; ".join(parts)
 
 
@@ -100,11 +100,15 @@ def _labels(dataset: xarray.Dataset, name: str) -> NDArray[Any]:
     return np.arange(dataset.sizes[name])
 
 
-def _unit_of(dataset: xarray.Dataset, name: str) -> str:
-    """Return the unit of the labels along a dimension, after a space; empty if there is none."""
+def unit_of(dataset: xarray.Dataset, name: str) -> str:
+    """Return the unit of the labels along a dimension; empty if there is none."""
     units = str(dataset[name].attrs.get("units", "1")) if name in dataset.coords else "1"
     has_unit = units != "1" and f"{name}{TEXT}" not in dataset.coords
-    return f" {units}" if has_unit else ""
+    return units if has_unit else ""
+
+
+def _after_space(unit: str) -> str:
+    return f" {unit}" if unit else ""
 
 
 def _word(value: Any) -> str:
@@ -125,7 +129,8 @@ def _place(dataset: xarray.Dataset, name: str, value: Any) -> tuple[str, int]:
     number = _in_unit_of(dataset, name, value)
     rows = [row for row, label in enumerate(labels.tolist()) if _is_alike(label, number)]
     if not rows:
-        near = ", ".join(map(_word, labels.tolist()[:MAX_SHOWN])) + _unit_of(dataset, name)
+        near = ", ".join(map(_word, labels.tolist()[:MAX_SHOWN]))
+        near += _after_space(unit_of(dataset, name))
         raise ExperimentError(f"{name}={value}: no member has this value; there are {near}")
     return dims[name], rows[0]
 
@@ -133,7 +138,7 @@ def _place(dataset: xarray.Dataset, name: str, value: Any) -> tuple[str, int]:
 def _in_unit_of(dataset: xarray.Dataset, name: str, value: Any) -> Any:
     """Convert a text with a unit to a number in the unit of a parameter. Return any other value
     unchanged."""
-    unit = _unit_of(dataset, name).strip()
+    unit = unit_of(dataset, name)
     if not unit or not isinstance(value, str) or not value[-1:].isalpha():
         return value
     from pydantic_core import PydanticCustomError

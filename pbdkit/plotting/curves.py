@@ -277,7 +277,9 @@ class Chart:
         for line in self.lines:
             first = [*(line.member.get(name, "") for name in parameters), *(line.of for _ in named)]
             for point in zip(line.x.tolist(), line.y.tolist(), strict=True):
-                rows.writerow([*first, *(repr(number).removesuffix(".0") for number in point)])
+                # The addition of 0 turns -0 into 0.
+                values = (repr(number + 0.0).removesuffix(".0") for number in point)
+                rows.writerow([*first, *values])
         return text.getvalue()
 
 

@@ -32,6 +32,7 @@ from pbdkit.lattice.raster import FRAME
 from pbdkit.model.bodies import AnyBody, Body as Shape, Sites
 from pbdkit.plotting.style import PlotOptions, in_its_units, is_number, label, plain
 from pbdkit.plugin import Vector
+from pbdkit.plugin.units import Scales
 
 if TYPE_CHECKING:
     import xarray
@@ -170,9 +171,12 @@ outline."""
 def shape_of(dataset: xarray.Dataset) -> Shape | None:
     """Return the outline of the body in a dataset. Return None if the dataset contains no outline,
     or if the body is given by its sites."""
+    experiment = json_attribute(dataset, "experiment")
     try:
+        # Values with units occur in the experiment of a member of a sweep.
+        units = Scales.model_validate({"units": experiment.get("units")}).units
         shape: Shape = TypeAdapter(AnyBody).validate_python(
-            json_attribute(dataset, "experiment")["body"]
+            experiment["body"], context={"units": units}
         )
     except (KeyError, ValidationError):
         return None

@@ -388,13 +388,16 @@ class _Drawing:
             self._note(LOAD_COLOUR, "body force" if loading.load.body_force else "force")
 
     def _arrows(self, at: Floats, vectors: Floats, longest: float, colour: str) -> None:
-        """Draw arrows at some of the places. An arrow starts at its place. If it would then point
-        into the body, it ends at its place instead."""
+        """Draw arrows at some of the places, or one arrow at their centre if they lie close
+        together. An arrow starts at its place. If it would then point into the body, it ends at its
+        place instead."""
         extent = float(np.ptp(at, axis=0).max()) * self.canvas.scale
         count = min(max(int(extent / ARROW_SPACING_PX), 1), MAX_ARROWS)
-        ends = np.linspace(0, len(at) - 1, count) if count > 1 else np.array([len(at) // 2])
-        selection = np.unique(ends.round().astype(int))
-        for place, vector in zip(at[selection], vectors[selection], strict=True):
+        selection = np.unique(np.linspace(0, len(at) - 1, count).round().astype(int))
+        places = at[selection]
+        if count == 1:
+            selection, places = np.array([len(at) // 2]), at.mean(axis=0, keepdims=True)
+        for place, vector in zip(places, vectors[selection], strict=True):
             pixels = _pixels(vector, longest)
             inwards = float((self.middle - place) @ vector) > 1e-9 * float(np.hypot(*vector))
             tail = place - pixels / self.canvas.scale if inwards else place

@@ -157,6 +157,7 @@ def forecast(scene: Scene) -> Forecast:
 
     kinds = kinds_at(scene.raster, scene.leading, 1)
     analysis, solver = Analysis(scene), scene.experiment.stepping
+    makes_steps = scene.experiment.solver.makes_steps
     sizes = _sizes(analysis)
     mode = analysis.oscillation(solver.relaxation, solver.memory) if solver.memory else None
     waves = [] if analysis.spectrum else _growing_waves(scene, wave_bound(scene))
@@ -178,7 +179,8 @@ def forecast(scene: Scene) -> Forecast:
             *_scene_warnings(scene),
             *_missing_supports(scene),
             *OBSTACLES_IGNORED[: len(scene.barriers)],
-            *analysis.warnings(),
+            # An equilibrium does not need the results of the analysis that take too long.
+            *(analysis.warnings() if makes_steps else analysis.obstructions()),
             *_divergence_in_time(scene),
             *_too_short(analysis),
             *waves,

@@ -132,10 +132,12 @@ function ledger({ model, bonds, counts, all, step, ends, shell, strain, limit, n
   const more = Object.entries(counts).filter(([state, n]) => n && !["intact", "broken"].includes(state));
   const words = [`${counts.broken} of ${bonds} bonds broke`, ...more.map(([state, n]) => `${n} ${state}`)];
   const number = (value) => (Number.isFinite(value) ? short(value, 6) : "not known");
+  const limits = limit.some(Number.isFinite);  // A model such as cohesive has none.
   const rows = step.map((one, n) => [
-    n + 1, one, ends[n].join("-"), shell[n], number(strain[n]), number(limit[n]),
+    n + 1, one, ends[n].join("-"), shell[n], number(strain[n]), ...(limits ? [number(limit[n])] : []),
   ]);
-  const listed = rows.length ? table(["order", "step", "bond", "shell", "strain", "breaks above"], rows) : "";
+  const names = ["order", "step", "bond", "shell", "strain", ...(limits ? ["breaks above"] : [])];
+  const listed = rows.length ? table(names, rows) : "";
   if (listed) listed.classList.add("long");
   const near = nearest ? [`Nearest to breaking at the end: bond ${nearest.bond.join("-")}, strain ${number(nearest.strain)}; it breaks above ${number(nearest.breaks_above)}.`] : [];
   const cut = all > rows.length ? [`The first ${rows.length} of ${all} are listed; \`pbdkit explain\` lists all.`] : [];

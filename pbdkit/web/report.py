@@ -34,7 +34,7 @@ from pbdkit.io.layout import (
     scene_of,
     with_principal_values,
 )
-from pbdkit.io.members import FILL, STATUS, SWEEP, TEXT, type_alone
+from pbdkit.io.members import FILL, STATUS, SWEEP, TEXT, type_alone, unit_of
 from pbdkit.io.open import reading
 from pbdkit.io.physical import TWIN_OF
 from pbdkit.lattice.raster import FOLLOWER, FRAME, LEADER
@@ -1070,7 +1070,10 @@ class SweepContent:
             "file": file_name(title),
             "facts": _facts(dataset),
             "experiment": experiment_text(specification),
-            "grid": [{"name": dim, "labels": _labels(dataset, dim)} for dim in grid],
+            "grid": [
+                {"name": dim, "labels": _labels(dataset, dim), "unit": unit_of(dataset, dim)}
+                for dim in grid
+            ],
             "status": dataset[STATUS].values.ravel().tolist(),
             "message": dataset[MESSAGE].values.ravel().tolist(),
             "scalars": list(numbers(dataset, grid)),
@@ -1083,7 +1086,10 @@ class SweepContent:
         points = max(MIN_POINTS, MAX_CURVE_POINTS // len(each))
         successful = [str(member[STATUS].item()) in STORED_STATUSES for member in each]
         if "position" not in each[0] or not any(successful):
-            note = "No lattices are shown: no member is complete, or `position` was not kept."
+            reason = "no member has a result"
+            if any(successful):
+                reason = "`position` was not kept; add it to `keep.variables`"
+            note = f"No lattices are shown: {reason}."
             plain = [{"curves": curves(member, points)} for member in each]
             return self._whole | {
                 "shared": {}, "members": plain, "left_out": [note], "thinned": False,

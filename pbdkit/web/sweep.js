@@ -61,8 +61,9 @@ export class SweepMap {
   }
 
   #draw() {
-    const { labels: columns, name: xName } = this.grid[this.across];
-    const { labels: rows, name: yName } = this.up < 0 ? { labels: [""], name: "" } : this.grid[this.up];
+    const named = ({ labels, name, unit }) => [labels, unit ? `${name} (${unit})` : name];
+    const [columns, xName] = named(this.grid[this.across]);
+    const [rows, yName] = this.up < 0 ? [[""], ""] : named(this.grid[this.up]);
     const [width, height] = [columns.length, Math.min(rows.length, Math.ceil(MOST / columns.length))];
     const values = this.shown?.values;
     const range = values ? extremes(values) : [0, 1];

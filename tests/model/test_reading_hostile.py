@@ -192,6 +192,13 @@ def test_slow_analyses_are_omitted_with_a_warning(parts: Any, said: str) -> None
     assert said in warning
 
 
+def test_omitted_analysis_of_steps_is_no_warning_for_an_equilibrium() -> None:
+    parts, _ = BODIES["many neighbours"]
+    found, _ = checked(diagnostics=[], solver={"type": "equilibrium"}, **parts)
+    assert found.spectral_radius is None
+    assert not [warning for warning in found.warnings if "omitted" in warning]
+
+
 def group(number: int, begin: int) -> dict[str, Any]:
     motion = {"type": "velocity", "velocity": [0.1, 0.0], "steps": 2}
     return {"select": {"numbers": [number]}, "motion": motion, "from": begin, "until": begin + 2}

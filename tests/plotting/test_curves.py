@@ -408,6 +408,12 @@ def test_histories_are_tables_with_a_row_for_each_point(torn):
     np.testing.assert_array_equal(u, torn.position[:, 7, 1] - torn.reference[7, 1])
 
 
+def test_tables_contain_no_negative_zero(torn):
+    chart = curves.history_chart(torn, "u", [8], (None, None), None)
+    chart.lines[0].y[0] = -0.0
+    assert chart.csv().splitlines()[1].endswith(",0,0")
+
+
 def test_map_of_a_crack_is_not_a_table(call, torn):
     torn.pbd.save("torn.nc")
     assert "cannot be written as CSV" in call("curve", "torn.nc", "crack", "-o", "crack.csv").err

@@ -149,6 +149,26 @@ def test_arrows_point_along_the_leader_motion():
         assert y1 == y0
 
 
+def test_force_on_particles_close_together_has_an_arrow_at_their_centre():
+    def ends(*points):
+        load = {"select": {"nearest": [*points]}, "force": [0.0, 1.0]}
+        whole = scene_of(
+            body={"type": "grid", "columns": 60, "rows": 4},
+            neighbours={"type": "chebyshev", "shells": 1},
+            rule={"type": "elastic", "poisson_ratio": 0.3},
+            frame={"type": "natural"},
+            loads=[load],
+        )
+        drawn = ElementTree.fromstring(picture_of(whole).svg)
+        (shaft,) = [s for s in drawn if s.get("stroke") == "#007A5A" and "L" in s.get("d")]
+        return np.array(numbers(shaft))
+
+    left, right = [30.0, 0.0], [31.0, 0.0]
+    centre = (ends(left) + ends(right)) / 2
+    np.testing.assert_allclose(ends(left, right), centre, atol=0.11)
+    assert ends(left)[0] < centre[0] - 1.0
+
+
 @pytest.mark.parametrize(
     ("motion", "way"),
     [

@@ -5,7 +5,9 @@ import pytest
 
 import pbdkit
 from pbdkit.model.reading import Source
+from pbdkit.plotting.data import shape_of
 from pbdkit.sweeps.specification import checked, coordinate
+from pbdkit.web.report import SweepContent
 
 PLATE = {
     "name": "plate",
@@ -113,6 +115,18 @@ def test_member_has_only_the_particles_and_bonds_of_a_plain_run(name, settings, 
         assert dict(one.sizes) == dict(plain.sizes)
         for each, variable in plain.variables.items():
             assert variable.equals(one[each].variable), each
+
+
+def test_outline_of_a_member_has_the_parameters_of_the_member(swept):
+    shape = shape_of(swept.pbd.member(poisson_ratio=0.3, steel=0.2, span=7))
+    assert shape.width == 7.0
+
+
+def test_report_states_why_lattices_are_missing_and_the_units_of_the_map(swept):
+    content = SweepContent(swept).within(10**6)
+    assert [axis["unit"] for axis in content["grid"]] == ["", "", "mm"]
+    (note,) = content["left_out"]
+    assert note == ("No lattices are shown: `position` was not kept; add it to `keep.variables`.")
 
 
 def test_maps_are_drawn_at_rest_without_recorded_positions(swept):
