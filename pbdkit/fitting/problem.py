@@ -12,6 +12,7 @@ be far from the solution.
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -23,7 +24,7 @@ from numpy.typing import NDArray
 from pbdkit.array_types import Floats
 from pbdkit.equilibrium.error_bound import UnconvergedError
 from pbdkit.equilibrium.system import Moves
-from pbdkit.errors import ExperimentError
+from pbdkit.errors import AccuracyWarning, ExperimentError
 from pbdkit.fitting.correlation import Correlation, estimate_correlation, is_correlated
 from pbdkit.fitting.observations import FieldObservation, NearbyPrediction, Observation, Prediction
 from pbdkit.fitting.parameter import Parameter
@@ -507,6 +508,8 @@ KINK = 0.5
 """Increase of the cost that is accepted for predictions that are not smooth, in units of the mean
 square residual. The cost has local minima of about this depth, and the fit is where the projection
 of the residuals on the derivatives vanishes, which are averages."""
+MAX_STALLED_SECANT = 1.5
+"""Largest step, in standard errors, with which such a fit ends with a warning, not an error."""
 MIN_RADIUS_SECANT = 2e-3
 """The same as `MIN_RADIUS` for predictions that are not smooth."""
 FROZEN = 1e-3
@@ -691,8 +694,15 @@ def solved(problem: Problem, start: Floats, loss: Loss = "linear") -> Solution:
         if trial is None:
             break
         at = trial
-    if remaining > (STALLED if problem.is_smooth else STALLED_SECANT):
+    if remaining > (STALLED if problem.is_smooth else MAX_STALLED_SECANT):
         raise UnconvergedError(region.explain(at))
+    if not problem.is_smooth and remaining > STALLED_SECANT:
+        warnings.warn(
+            f"the fit ends {remaining:.1f} standard errors from its last step, because the curve "
+            "has kinks where cells begin to soften; fewer steps make it smoother",
+            AccuracyWarning,
+            stacklevel=2,
+        )
     ratio = spread_of(at.residuals, problem.size, loss)
     on_bounds = _on_bounds(problem, at.z)
     return Solution(at.z, at, directions, ratio, unidentified, on_bounds, region.evaluations)
