@@ -32,13 +32,16 @@ from pbdkit.linear.spectrum import NEUTRAL
 from pbdkit.linear.stencil import Bound, bounds_the_body, stability_remedy, wave_bound
 from pbdkit.memory import machine_memory
 from pbdkit.model.motions import Newton
-from pbdkit.plugin import Anchors, Calibrated
+from pbdkit.plugin import Anchors, Calibrated, StoresEnergy
 from pbdkit.plugin.units import LENGTH
+from pbdkit.plugin.vector import vector
 from pbdkit.scene.leader_groups import kinds_at, kinds_of_places
 from pbdkit.scene.memory_estimate import LARGEST_REPEATED, MIB, Sizes, sizes_of
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.divergence import largest_offset
 from pbdkit.stepping.engine_choice import choose, seconds_of
 from pbdkit.stepping.leaders import NewtonForces
+from pbdkit.stepping.rule_evaluation import Evaluator
 from pbdkit.stepping.state import initial_state
 
 if TYPE_CHECKING:
@@ -160,7 +163,14 @@ def forecast(scene: Scene) -> Forecast:
     makes_steps = scene.experiment.solver.makes_steps
     sizes = _sizes(analysis)
     mode = analysis.oscillation(solver.relaxation, solver.memory) if solver.memory else None
-    waves = [] if analysis.spectrum else _growing_waves(scene, wave_bound(scene))
+    # Deformations change the eigenvalues of nonlinear rules. Their limit is that of plane waves, as
+    # in the warnings of a run, if it is lower than that of the body at rest.
+    nonlinear = not scene.experiment.rule.linear
+    bound = wave_bound(scene) if nonlinear or not analysis.spectrum else None
+    fields = {name: getattr(analysis, name) for name in ANALYSIS_FIELDS}
+    limit = bound.largest_stable_relaxation(solver.memory) if bound else None
+    if limit and (limit_at_rest := analysis.largest_stable_relaxation):
+        fields["largest_stable_relaxation"] = min(limit, limit_at_rest)
     return Forecast(
         particles=scene.raster.count,
         followers=int(np.count_nonzero(kinds == FOLLOWER)),
@@ -183,9 +193,9 @@ def forecast(scene: Scene) -> Forecast:
             *(analysis.warnings() if makes_steps else analysis.obstructions()),
             *_divergence_in_time(scene),
             *_too_short(analysis),
-            *waves,
+            *_growing_waves(scene, bound),
         ],
-        **{name: getattr(analysis, name) for name in ANALYSIS_FIELDS},
+        **fields,
     )
 
 
@@ -300,7 +310,68 @@ def _scene_warnings(scene: Scene) -> list[str]:
             f"record: the output of {sizes.output / 2**30:.3g} GiB exceeds this machine's memory; "
             "record fewer steps to open it at once"
         )
-    return warnings
+    return [*warnings, *_stress_of_nonlinear_rules(scene)]
+
+
+NONLINEAR = 0.01
+"""Relative deviation of the energy of bonds from a quadratic one up to which linear elasticity is
+accurate enough for stresses."""
+STRAIN_OF_LOADS = 0.01
+"""Strain at which rules are examined if the strain that loads cause is not known."""
+
+
+def _stress_of_nonlinear_rules(scene: Scene) -> list[str]:
+    """Warn of diagnostics that compute stresses by linear elasticity, if the bonds of the rule are
+    not linear at the strains that leaders prescribe."""
+    rule = scene.experiment.rule
+    diagnostics = [
+        (n, part.type)
+        for n, part in enumerate(scene.experiment.diagnostics)
+        if "material" in part.needs
+    ]
+    if not (diagnostics and isinstance(rule, StoresEnergy)):
+        return []
+    strain = max(_prescribed_strain(scene), STRAIN_OF_LOADS * bool(scene.loads))
+    ratio = 1.0
+    with suppress(Exception), np.errstate(all="ignore"):  # The run reports the error.
+        ratio = _energy_ratio(scene, strain)
+    if not abs(ratio - 1.0) > NONLINEAR:
+        return []
+    return [
+        f"diagnostics.{n}: '{kind}' is computed from strains by the linear elasticity of the rule, "
+        f"but at a strain of {strain:.2g}, as leaders or loads can cause, bonds of the rule "
+        f"'{rule.type}' have {ratio:.3g} times the energy of linear elasticity; use "
+        "'stress-strain', 'reaction' and 'strain-energy', which use the forces of the rule"
+        for n, kind in diagnostics
+    ]
+
+
+def _prescribed_strain(scene: Scene) -> float:
+    """Return the largest motion of a leader group, relative to the size of the body."""
+    ends, raster = scene.raster.body_ends(), scene.raster
+    local = [largest_offset(leading, scene.experiment.steps) for leading in scene.driven]
+    offsets = np.max(raster.communicator.allgather(local), axis=0)
+    return float(np.max(offsets, initial=0.0) / max(1e-300, np.abs(ends[1] - ends[0]).max()))
+
+
+def _energy_ratio(scene: Scene, strain: float) -> float:
+    """Return the energy of a bond at a strain, divided by the quadratic one with the same energy at
+    small strains. Of all bonds, under tension and compression, the ratio that differs most from 1
+    is returned."""
+    evaluator, still = Evaluator(scene), vector(np.zeros(scene.axes))
+    ratios = [1.0]
+    for slots in scene.neighbourhood.slots:
+        for slot, to in zip(slots, evaluator.everywhere(slots), strict=True):
+            small, *large = (
+                np.asarray(evaluator.energy(slot.rest * size, still, to)[0])
+                for size in (SMALL * strain, strain, -strain)
+            )
+            ratios += [float(np.max(energy * SMALL**2 / small)) for energy in large]
+    return max(ratios, key=lambda ratio: abs(ratio - 1.0))
+
+
+SMALL = 1e-3
+"""Fraction of a strain at which the energy is quadratic."""
 
 
 def _growing_waves(scene: Scene, bound: Bound | None) -> list[str]:

@@ -38,7 +38,7 @@ from pbdkit.linear.spectrum import (
     modes,
     spectrum,
 )
-from pbdkit.linear.stencil import LITTLE_MEMORY
+from pbdkit.linear.stencil import LITTLE_MEMORY, wave_bound
 from pbdkit.model.solver import Stepping
 from pbdkit.plugin import Calibrated
 from pbdkit.progress import Watch
@@ -161,6 +161,10 @@ def _minimise(function: Any, low: float, high: float) -> float:
 MARGIN = 0.02
 """Relative margin that is added at the ends of a spectrum that is computed by iteration, because
 iteration may underestimate its width."""
+NONLINEAR_MARGIN = 0.25
+"""Relative margin of the fastest mode of nonlinear rules, which are linearised at rest."""
+MAX_PRODUCT = 4.0
+"""Product of relaxation and largest 1 - λ at which no momentum below 1 is stable."""
 ROUGH = 1e-3
 """Relative accuracy of solutions."""
 MOVES = 24
@@ -203,12 +207,28 @@ def chosen_weights(scene: Scene) -> StepWeights:
     rest.u[...] = 0.0
     try:
         eigenvalues, is_sure = _eigenvalues(plain, rest)
+        if not scene.experiment.rule.linear:
+            eigenvalues = _with_margin(plain, eigenvalues, prescribed[0])
         weights = best_weights(eigenvalues, *prescribed)
         if prescribed[1] is None and not is_sure and weights.memory > LITTLE_MEMORY:
             weights = best_weights(eigenvalues, prescribed[0], LITTLE_MEMORY)
     except NoStableWeightsError as error:
         raise _refusal(f"{error}; {REMEDY}") from None
     return weights
+
+
+def _with_margin(scene: Scene, eigenvalues: Complex, relaxation: float | None) -> Complex:
+    """Return the eigenvalues with one more, which is smaller than those of the body and of plane
+    waves at rest by a margin, because a deformation changes the eigenvalues of nonlinear rules.
+
+    If a prescribed relaxation leaves less room, the eigenvalues are returned unchanged.
+    """
+    bound = wave_bound(scene)
+    largest = max(float((1.0 - eigenvalues).real.max()), 1.0 - bound.smallest if bound else 0.0)
+    largest *= 1.0 + NONLINEAR_MARGIN
+    if relaxation is not None and relaxation * largest >= MAX_PRODUCT:
+        return eigenvalues
+    return np.append(eigenvalues, 1.0 - largest)
 
 
 def _refuse(scene: Scene) -> None:

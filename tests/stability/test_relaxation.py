@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from itertools import product
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
 from property_cases import BOTH_ENDS_HELD, FRAMES, LATTICES, RULES, experiment
 
 import pbdkit
+from pbdkit.components.rules import Springs
 from pbdkit.linear.spectrum import has_symmetric_rows
+from pbdkit.plugin import length
 from pbdkit.scene.scene import Scene, build_scene
 from pbdkit.stability.analysis import Analysis
+from pbdkit.stability.forecast import forecast
 from pbdkit.stability.relaxation import (
     MARGIN,
     NoStableWeightsError,
@@ -149,6 +153,78 @@ def test_check_prints_the_choice_and_its_basis(call):
     assert ", for the step linearised at rest: the rule is not linear or bonds can break" in torn
     found = json.loads(call("check", "paper/a", "--json", *auto[:2]).out)
     assert (found["relaxation"], found["memory"]) == (1.0, pytest.approx(0.841661, abs=1e-6))
+
+
+PULLED = [
+    {"select": {"edge": "left"}, "motion": {"type": "hold"}},
+    {
+        "select": {"edge": "right"},
+        "motion": {"type": "velocity", "velocity": [0.01, 0.0], "steps": 200},
+    },
+]
+SPRINGS = {
+    "name": "springs",
+    "body": {"type": "grid", "columns": 12, "rows": 6},
+    "lattice": {"type": "hexagonal", "a": 1.0},
+    "rule": {"type": "springs"},
+    "frame": {"type": "natural"},
+    "leaders": PULLED,
+    "steps": 300,
+}
+
+
+def test_choice_for_a_nonlinear_rule_is_stable_in_the_deformed_body():
+    auto = {"solver": {"type": "stepping", "relaxation": "auto", "memory": "auto"}}
+    ds = pbdkit.run(SPRINGS | auto, progress=False)
+    assert ds.attrs["status"] == "complete"
+    relaxation = json.loads(ds.attrs["experiment"])["solver"]["relaxation"]
+    assert relaxation < 0.85 * pbdkit.analyse(SPRINGS | auto).largest_stable_relaxation
+
+
+def test_check_and_run_name_one_limit_for_a_nonlinear_rule():
+    solver = {"solver": {"type": "stepping", "relaxation": 3.59, "memory": 0.79194}, "steps": 1}
+    predicted = forecast(pbdkit.analyse(SPRINGS | solver).scene)
+    (warning,) = [text for text in predicted.warnings if "can diverge" in text]
+    assert f"it is stable below {predicted.largest_stable_relaxation:.4g}" in warning
+    with pytest.warns(pbdkit.errors.StabilityWarning, match=re.escape(warning)):
+        pbdkit.run(SPRINGS | solver, progress=False)
+
+
+class Cubic(Springs):
+    """Springs with a cubic term that equals the linear one at an elongation of 0.1."""
+
+    type: Literal["cubic"] = "cubic"
+
+    @staticmethod
+    def energy(d, r, w, p):
+        energy = Springs.energy(d, r, w, p)
+        return energy + 50.0 * energy * (length(r + d) - w.rest) ** 2
+
+
+@pytest.mark.parametrize(
+    ("rule", "velocity", "words"),
+    [
+        (
+            "cubic",
+            0.01,
+            ["'stress' is computed from strains by the linear elasticity", "'reaction'"],
+        ),
+        ("cubic", 1e-5, []),
+        ("springs", 0.01, []),
+    ],
+)
+def test_stress_of_a_nonlinear_rule_has_a_warning_where_strains_are_large(rule, velocity, words):
+    motion = {"type": "velocity", "velocity": [velocity, 0.0], "steps": 200}
+    leaders = [PULLED[0], PULLED[1] | {"motion": motion}]
+    given = SPRINGS | {
+        "rule": {"type": rule},
+        "leaders": leaders,
+        "diagnostics": [{"type": "stress", "youngs_modulus": 1.0}],
+    }
+    scene = pbdkit.analyse(given, components=[Cubic]).scene
+    warnings = [text for text in forecast(scene).warnings if text.startswith("diagnostics.0")]
+    assert len(warnings) == bool(words)
+    assert [word for word in words if word not in warnings[0]] == []
 
 
 @pytest.mark.parametrize("name", ["memory", "threads"])
