@@ -140,8 +140,9 @@ def test_example_with_state_passes_conformance(interface, tmp_path, monkeypatch,
         assert "declares-what-it-remembers" in [outcome.property for outcome in report.ran]
 
 
-def test_example_of_a_cosine_passes_conformance(tmp_path, monkeypatch, interpreted):
-    (code,) = (b for b in blocks(text_of(pbdkit.FollowerRule)) if "class AngleStiffness" in b)
+@pytest.mark.parametrize("name", ["AngleStiffness", "Stiffening"])
+def test_examples_of_rules_pass_conformance(name, tmp_path, monkeypatch, interpreted):
+    (code,) = (b for b in blocks(text_of(pbdkit.FollowerRule)) if f"class {name}" in b)
     for report in reports_on(pbdkit.FollowerRule, code, tmp_path, monkeypatch):
         assert report.holds, str(report)
         assert "is-the-same-compiled" in [outcome.property for outcome in report.ran]
