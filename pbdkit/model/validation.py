@@ -141,7 +141,7 @@ _LONG = re.compile(r"(?<=than )(?=[-\d.]{20})[-\d.]+|(?<=equal to )(?=[-\d.]{20}
 
 def report(error: ValidationError, source: Source) -> ExperimentError:
     """Convert a pydantic error to an ExperimentError with one line for each of the first faults."""
-    details = [_plainly(fault) for fault in error.errors(include_url=False)]
+    details = [_as_written(_plainly(f), source) for f in error.errors(include_url=False)]
     faults = [f for f in details if not _follows(f, details)]
     lines = [source.message(*_described(fault)) for fault in faults[:MAX_FAULTS]]
     if len(faults) > MAX_FAULTS:
@@ -154,6 +154,34 @@ def _plainly(fault: Any) -> Any:
     where = tuple(word for word in fault["loc"] if word not in (*FORMS, "[key]"))
     message = {"msg": f"should be {WORD}"} if fault["loc"][-1:] == (WORD,) else {}
     return fault | {"loc": where} | message
+
+
+def _as_written(fault: Any, source: Source) -> Any:
+    """Return the fault with value and bound in the unit of the source, if the value was given with
+    a unit and is beyond a bound."""
+    bound, number = _bounds(fault.get("ctx", {})), fault["input"]
+    value = source.data
+    for key in fault["loc"]:
+        try:
+            value = value[key]
+        except (TypeError, LookupError):
+            return fault
+    text = TEXT.fullmatch(value) if isinstance(value, str) else None
+    if not (bound and text and fault["type"] in WRITTEN_BOUNDS):
+        return fault
+    scaled = [b * float(text[1]) / number if number else b for b in bound]
+    message = WRITTEN_BOUNDS[fault["type"]].format(*scaled)
+    unit = f" {text[2]}" if scaled[0] else ""
+    return fault | {"msg": f"should be {message}{unit}", "input": value.strip(), "type": "bound"}
+
+
+WRITTEN_BOUNDS = {
+    "greater_than": "greater than {:.6g}",
+    "greater_than_equal": "greater than or equal to {:.6g}",
+    "less_than": "less than {:.6g}",
+    "less_than_equal": "less than or equal to {:.6g}",
+}
+"""Conditions of bounds by the type of an error of pydantic."""
 
 
 def _described(fault: Any) -> tuple[tuple[str | int, ...], str]:
@@ -217,7 +245,12 @@ def _decimal_commas(fault: Any) -> str:
 
 
 def _bound(context: Any) -> float:
-    return next(float(context[k]) for k in ("gt", "ge", "lt", "le") if k in context)
+    return _bounds(context)[0]
+
+
+def _bounds(context: Any) -> list[float]:
+    """Return the bound that a value exceeds, as a list that is empty if there is none."""
+    return [float(context[k]) for k in ("gt", "ge", "lt", "le") if k in context]
 
 
 def _follows(fault: Any, faults: list[Any]) -> bool:

@@ -80,7 +80,15 @@ class Strict(BaseModel, metaclass=Parameters):
     if not TYPE_CHECKING:  # A type checker reports assignments without it.
 
         def __setattr__(self, name: str, value: Any) -> None:
-            """Set a private attribute. AttributeError is raised for a parameter."""
+            """Set a private attribute. AttributeError is raised for others of a frozen model."""
+            is_frozen = self.model_config.get("frozen") and not name.startswith("_")
+            if is_frozen and not hasattr(type(self), name) and name not in type(self).model_fields:
+                raise AttributeError(
+                    f"{type(self).__name__}.{name} cannot be assigned, because components do not "
+                    "change; declare a parameter, return constants from a method such as "
+                    "`parameters` or `weights`, and declare values that change in a run as state "
+                    "variables (`Remembered`)"
+                )
             if name in type(self).model_fields and self.model_config.get("frozen"):
                 owner = type(self).__name__
                 path = name if owner == "Experiment" else f"PART.{name}"

@@ -4,16 +4,19 @@
 from __future__ import annotations
 
 import gc
+import re
 import time
 import tracemalloc
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import pytest
+from pydantic import Field
 
 import pbdkit
+from pbdkit.plugin.units import LENGTH
 from pbdkit.scene.scene import Scene, build_scene
 
 TENSILE = """\
@@ -304,3 +307,24 @@ def test_long_equal_motions_are_compared_quickly(tensile: dict[str, Any]) -> Non
     begun = time.process_time()
     assert len(build_scene(experiment).leading) == 2
     assert time.process_time() - begun < 0.5
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        ("-0.2 mm", "should be greater than 0, got '-0.2 mm'"),
+        ("9e9 cm", "should be less than or equal to 200000 cm, got '9e9 cm'"),
+    ],
+)
+def test_bound_of_a_value_with_a_unit_is_in_that_unit(value: str, text: str) -> None:
+    class Limited(pbdkit.FollowerRule):
+        """A rule with a length between bounds."""
+
+        type: Literal["limited"] = "limited"
+        size: Annotated[float, Field(gt=0.0, le=1e6), LENGTH] = 1.0
+
+        gather = apply = staticmethod(lambda *_: None)
+
+    settings = {"units": {"length": "2 mm"}, "rule": {"type": "limited", "size": value}}
+    with pytest.raises(pbdkit.ExperimentError, match=f"rule.size: {re.escape(text)}"):
+        pbdkit.load("paper/a", components=[Limited], settings=settings)

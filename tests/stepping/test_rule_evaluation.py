@@ -124,6 +124,14 @@ class GrowsByCubes(Plain):
         return (1.0 + 1e3 * pbdkit.plugin.squared_length(mean)) * mean
 
 
+class AssignsItself(Plain):
+    type: Literal["assigns-itself"] = "assigns-itself"
+
+    def weights(self, slot, setting):
+        self.rest = 1.0
+        return {"rest": self.rest}
+
+
 class StartsAtVector(pbdkit.plugin.RenewsParticles, Plain):
     type: Literal["starts-at-vector"] = "starts-at-vector"
 
@@ -191,6 +199,8 @@ MISTAKES = {
     GathersList: ("returned list as value 2 of 2; return numbers", "evaluation.py, line "),
     AddsOtherShapes: ("failed at the beginning of the run in `apply`: ValueError: operands could",
                       "; compute one value for each particle", "evaluation.py, line "),
+    AssignsItself: ("AssignsItself.rest cannot be assigned", "as state variables (`Remembered`)",
+                    "evaluation.py, line "),
     StartsAtVector: ("the initial value of 'way' is Vector", "not a number", "as way_x and way_y"),
     Array: ("Diagnostic 'array' failed at step 0: `measure` returned ndarray", TUPLE),
     Alone: ("Diagnostic 'alone' failed", "`variables` returned Variable", TUPLE),
