@@ -57,11 +57,11 @@ class Extensometer(Gauge):
         return self
 
     def variables(self) -> tuple[Variable, ...]:
-        """Declare `extension`."""
+        """Declare the variable `extension`."""
         return (Variable("extension", (), "extension between two points", LENGTH.lattice),)
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
-        """Return the extension."""
+        """Return the extension at a moment."""
         rows = now.nearest(self.between)
         if rows[0] == rows[1]:
             raise ExperimentError(
@@ -98,11 +98,11 @@ class StrainGauge(Gauge):
     )
 
     def variables(self) -> tuple[Variable, ...]:
-        """Declare `gauge_strain`."""
+        """Declare the variable `gauge_strain`."""
         return (Variable("gauge_strain", (), "mean strain along the strain gauge", "1"),)
 
     def measure(self, now: Moment) -> tuple[Any, ...]:
-        """Return the strain."""
+        """Return the mean strain at a moment."""
         angle = np.radians(self.angle)
         along = np.array([np.cos(angle), np.sin(angle)])
         ends = [np.array(self.at) + side * self.length / 2.0 * along for side in (-1.0, 1.0)]

@@ -40,18 +40,18 @@ class Channel(ABC):
         thickness."""
 
     def range_in(self, scene: Scene) -> tuple[float, float] | None:
-        """Return the smallest and the largest value in a run, or None if only the run tells."""
+        """Return the smallest and the largest value in a run, or None if they are known only after it."""
         return None
 
 
 @dataclass(frozen=True)
 class Time(Channel):
-    """Time in steps."""
+    """Number of steps from the start of a run."""
 
     label = "time (step)"
 
     def read(self, time: float, state: State, tables: Tables) -> float:
-        """Return the time."""
+        """Return the number of steps."""
         return time
 
 
@@ -65,7 +65,7 @@ class GroupForce(Channel):
 
     @property
     def label(self) -> str:
-        """Name the group."""
+        """Label with the index of the group."""
         return f"force on group {self.group}"
 
     def read(self, time: float, state: State, tables: Tables) -> float:
@@ -84,7 +84,7 @@ class LoadForce(Channel):
 
     @property
     def label(self) -> str:
-        """Name the load."""
+        """Label with the index of the load."""
         return f"load {self.load}"
 
     def read(self, time: float, state: State, tables: Tables) -> float:
@@ -103,7 +103,7 @@ class GroupDisplacement(Channel):
 
     @property
     def label(self) -> str:
-        """Name the group."""
+        """Label with the index of the group."""
         return f"displacement of group {self.group}"
 
     def read(self, time: float, state: State, tables: Tables) -> float:
@@ -123,7 +123,7 @@ class LoadDisplacement(Channel):
 
     @property
     def label(self) -> str:
-        """Name the load."""
+        """Label with the index of the load."""
         return f"displacement of load {self.load}"
 
     def read(self, time: float, state: State, tables: Tables) -> float:

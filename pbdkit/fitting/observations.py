@@ -1041,7 +1041,7 @@ class CurveObservation(RunObservation):
         return self.value.label, self.over.label, True
 
     def places(self) -> Floats:
-        """Return the abscissae."""
+        """Return the abscissae of the rows."""
         return self.along[:, None]
 
     def part(self, mask: NDArray[np.bool_]) -> CurveObservation:

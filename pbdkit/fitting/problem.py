@@ -455,7 +455,7 @@ MAX_ITERATIONS = 50
 """Maximum number of Gauss-Newton iterations."""
 
 MAX_ITERATIONS_SECANT = 15
-"""The same for predictions that are not smooth."""
+"""Maximum number of iterations for predictions that are not smooth."""
 MIN_RADIUS = 1e-5
 """Smallest radius of the trust region, relative to the scale of each parameter."""
 MIN_GAIN = 0.1
@@ -500,9 +500,9 @@ MODULUS = "Young's modulus"
 CONVERGED = 1e-2
 """Largest step, in standard errors, of a converged fit."""
 CONVERGED_SECANT = 0.15
-"""The same for predictions that are not smooth."""
+"""Largest step of a converged fit of predictions that are not smooth."""
 STALLED_SECANT = 0.5
-"""The same as `STALLED` for predictions that are not smooth. Their derivatives are averages over a
+"""Value of `STALLED` for predictions that are not smooth. Their derivatives are averages over a
 range of about this size."""
 KINK = 0.5
 """Increase of the cost that is accepted for predictions that are not smooth, in units of the mean
@@ -511,7 +511,7 @@ of the residuals on the derivatives vanishes, which are averages."""
 MAX_STALLED_SECANT = 1.5
 """Largest step, in standard errors, with which such a fit ends with a warning, not an error."""
 MIN_RADIUS_SECANT = 2e-3
-"""The same as `MIN_RADIUS` for predictions that are not smooth."""
+"""Value of `MIN_RADIUS` for predictions that are not smooth."""
 FROZEN = 1e-3
 """Change of all residuals between the bounds below which an unknown is fixed.
 

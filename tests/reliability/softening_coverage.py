@@ -12,7 +12,7 @@ standard error. Exits with 1 if fewer than 93 % of the trials hold the true valu
 sampling explains (three times its standard deviation).
 
 With `--finer`, further trials fit curves of the shipped lattice, which shows the error of the
-coarse lattice. With `--time`, the shipped fit `notched-beam`, whose beam is on the shipped lattice,
+coarse lattice. With `--time`, the shipped fit `notched-beam`, with the beam on the shipped lattice,
 is timed; it has to take at most 60 s of processor time.
 """
 
