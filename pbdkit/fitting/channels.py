@@ -40,7 +40,8 @@ class Channel(ABC):
         thickness."""
 
     def range_in(self, scene: Scene) -> tuple[float, float] | None:
-        """Return the smallest and the largest value in a run, or None if they are known only after it."""
+        """Return the smallest and the largest value in a run; None if only its results contain
+        them."""
         return None
 
 

@@ -58,8 +58,8 @@ the values are rounding errors.
 """
 
 COARSE = 1e-2
-"""Initial noise of several measurements, relative to the measured values. The noise of others may be known, and the first fit must not
-follow one of them alone."""
+"""Initial noise of several measurements, relative to the measured values. The noise of others may
+be known, and the first fit must not follow one of them alone."""
 MAX_NOISE_ITERATIONS = 30
 """Maximum number of fits by which the noise of several measurements is estimated."""
 NOISE_RTOL = 0.01
