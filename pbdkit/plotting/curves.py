@@ -31,7 +31,7 @@ from pbdkit.io.layout import INDICES, rows_at, scene_of
 from pbdkit.io.members import STATUS, SWEEP, TEXT, type_alone, with_experiment
 from pbdkit.plotting.data import CHOSEN_BY, OF_A_RUN, SUM_BLOCK_BYTES, in_units, scalar, variable
 from pbdkit.plotting.figure_layout import new_figure
-from pbdkit.plotting.style import in_its_units, label, plain
+from pbdkit.plotting.style import in_its_units, label, plain, signed
 from pbdkit.scene.scene import Scene
 
 FORCE_OF = {"load": "load_resultant", "obstacle": "contact_force", "leader_group": "reaction"}
@@ -378,7 +378,9 @@ def lines_of(dataset: xarray.Dataset, x: Any, y: Any) -> list[Line]:
         along = dict(zip(dims, place, strict=True))
         member = {dim: _value_of(dataset, dim, n) for dim, n in along.items()}
         name = ", ".join(
-            f"{dim} {value:.4g}" if isinstance(value, float) else f"{dim} {value}"
+            f"{dim} {value:.4g}{_unit_of(dataset, dim)}"
+            if isinstance(value, float)
+            else f"{dim} {value}"
             for dim, value in member.items()
         )
         value = _number(dataset, dims[0], place[0]) if len(dims) == 1 else None
@@ -396,6 +398,13 @@ def _value_of(dataset: xarray.Dataset, dim: str, place: int) -> float | str:
             value = dataset[name].values[place]
             return float(value) if isinstance(value, np.floating) else type_alone(str(value))
     return str(place)
+
+
+def _unit_of(dataset: xarray.Dataset, dim: str) -> str:
+    """Return the unit of a parameter after a space; empty for lattice units and steps."""
+    units = str(dataset[dim].attrs.get("units", ""))
+    is_short = units not in ("", "1") and "unit" not in units and "step" not in units
+    return f" {signed(units)}" if is_short else ""
 
 
 def _heading(dataset: xarray.Dataset, dim: str) -> str:

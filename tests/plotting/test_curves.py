@@ -363,6 +363,13 @@ def test_sweep_has_one_line_per_member(swept):
     assert ax.figure.axes[1].get_ylabel() == "relaxation"
 
 
+@pytest.mark.parametrize(("units", "name"), [("MPa", "0.4 MPa"), ("lattice unit", "0.4")])
+def test_names_of_members_have_the_unit_of_the_parameter(swept, units, name):
+    ds = swept.assign_coords(relaxation=swept.relaxation.assign_attrs(units=units))
+    (first, *_) = curves.lines_of(ds, ds.time, ds.pe1.sum("particle"))
+    assert first.name == f"relaxation {name}"
+
+
 def test_loads_of_a_sweep_have_one_line_per_member():
     loaded = experiment(
         **CALIBRATED, leaders=[HELD], steps=5,
