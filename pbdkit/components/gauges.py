@@ -87,7 +87,7 @@ class StrainGauge(Gauge):
     symbol = "strain"
 
     type: Literal["strain-gauge"] = "strain-gauge"
-    at: Place = Field(description="Centre of the gauge.", examples=[(3.0, 2.0)])
+    at: Place = Field(description="Centre of the gauge.", examples=[(2.0, 1.0)])
     length: Annotated[float, Field(gt=0.0, le=1e100), LENGTH] = Field(
         description="Length of the gauge (lattice units).", examples=[2.0]
     )
