@@ -304,12 +304,13 @@ class Response:
                 return np.concatenate([value.ravel() for value in _measure(diagnostic, moment)])
 
         columns = np.stack([*self._columns(flat)], axis=1)
+        self.problem.convert_to_units(columns, self.solution.z)
         shapes = [(*value.shape, self.problem.size) for value in values]
         parts = np.split(columns, np.cumsum([value.size for value in values])[:-1])
         return values, [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
 
     def _columns(self, function: Callable[[Moment], Floats]) -> Iterator[Floats]:
-        """Generate the derivatives with respect to each unknown."""
+        """Generate the derivatives with respect to the number of each unknown."""
         problem, errors = self.problem, self.solution.errors
         scene, u = self.resting_scene.scene, self.resting_scene.state.u
         value = function(StateMoment(self.resting_scene.state, self._tables))
@@ -323,12 +324,11 @@ class Response:
         for n, (unknown, du) in enumerate(
             zip(problem.unknowns, self.prediction.changes, strict=True)
         ):
-            of_number = along(du, float(errors[n]) * unknown.scale) + unknown.parameter.derivative(
+            yield along(du, float(errors[n]) * unknown.scale) + unknown.parameter.derivative(
                 scene.experiment,
                 lambda experiment: self._at(function, scene_like(scene, experiment), u),
                 DERIVATIVES,
             )
-            yield unknown.scale * of_number
         _, own = next(problem.own_slices())
         for n in range(len(problem.unknowns), problem.size):
             is_boundary = 0 <= n - own.start < len(self.prediction.answers)

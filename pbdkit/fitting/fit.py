@@ -132,11 +132,14 @@ def _fit_specimens(
 def _fit(fit: Fit, experiment: Experiment, components: ComponentClasses) -> Fitted:
     if fit.sampler:
         refuse_no_sampler()
-    problem, located = problem_of(fit, experiment, components=components), None
+    located = None
+    if fit.crack_tip:
+        fit, experiment = _with_settings_applied(fit, experiment, components)
+    problem = problem_of(fit, experiment, components=components)
     refuse_other_names(fit, problem)
     if fit.crack_tip:
-        solve = partial(_solve_with, fit, components)
-        problem, solution, located = locate_tip(fit.crack_tip, experiment, solve)
+        solve_with = partial(_solve_with, fit, components)
+        problem, solution, located = locate_tip(fit.crack_tip, experiment, solve_with)
     else:
         problem, solution = _solve(problem, fit)
     names = [*fit.unknown]
@@ -254,6 +257,20 @@ def _with_settings(
     for path, value in settings.items():
         source = with_value(source, path, value, f"{place}: {path}", Experiment.defaults())
     return Experiment.build(source, components)
+
+
+def _with_settings_applied(
+    fit: Fit, experiment: Experiment, components: ComponentClasses
+) -> tuple[Fit, Experiment]:
+    """Return a fit of one measurement without `settings`, and the experiment with them.
+
+    The cut of a crack tip is then moved in the experiment that predicts the measurement.
+    """
+    (measurement,) = fit.measured
+    settings = measurement.settings
+    changed = _with_settings(experiment, settings, fit, "measured.settings", components)
+    plain = measurement.model_copy(update={"settings": {}})
+    return fit.model_copy(update={"measured": (plain,)}), changed
 
 
 def _refuse_too_few(observation: Observation, unknowns: int) -> None:

@@ -17,8 +17,10 @@ from pydantic import (
     AfterValidator,
     BeforeValidator,
     ConfigDict,
+    Discriminator,
     Field,
     SerializeAsAny,
+    Tag,
     TypeAdapter,
     ValidationError,
     ValidationInfo,
@@ -67,6 +69,7 @@ from pbdkit.model.schema import DIALECT
 from pbdkit.model.solver import Equilibrium, Toward
 from pbdkit.model.validation import closed_part, fault, read_columns, report
 from pbdkit.plugin.component import Component, Strict
+from pbdkit.plugin.schedule import AS_LIST, AS_PART, AS_WORD, PLAIN, WITH_UNITS, WORD
 from pbdkit.plugin.units import LENGTH, number_with_unit
 from pbdkit.scene.scene import Scene, build_scene
 
@@ -100,9 +103,39 @@ SpecimenName = Annotated[
     str, BeforeValidator(lambda name: str(name), json_schema_input_type=str | int)
 ]
 """Name of a specimen; a number is read as text."""
-Count = Annotated[int, Field(ge=0, le=40)] | Literal["auto"]
+
+
+def _word_or(form: str) -> Discriminator:
+    """Select the member of a union for words, or that for all other values."""
+    return Discriminator(lambda value: AS_WORD if isinstance(value, str) else form)
+
+
+def _has_text(value: Any) -> bool:
+    return isinstance(value, (list, tuple)) and any(isinstance(item, str) for item in value)
+
+
+Count = Annotated[
+    Annotated[int, Field(ge=0, le=40), Tag(PLAIN)] | Annotated[Literal["auto"], Tag(WORD)],
+    Discriminator(lambda value: WORD if isinstance(value, str) else PLAIN),
+]
+Counts = Annotated[
+    Annotated[Count, Tag(PLAIN)] | Annotated[tuple[Count, ...], Field(strict=False), Tag(AS_LIST)],
+    Discriminator(lambda value: AS_LIST if isinstance(value, (list, tuple)) else PLAIN),
+]
 ModesOfGroups = Modes | tuple[Modes, ...]
-Axes = Annotated[tuple[Literal["x", "y"], ...], Field(strict=False, min_length=1, max_length=2)]
+
+
+def _in_order(axes: tuple[str, ...]) -> tuple[str, ...]:
+    if [*axes] != sorted({*axes}):
+        raise ValueError(f"expected [x], [y] or [x, y], got [{', '.join(axes)}]")
+    return axes
+
+
+Axes = Annotated[
+    tuple[Literal["x", "y"], ...],
+    Field(strict=False, min_length=1, max_length=2),
+    AfterValidator(_in_order),
+]
 
 
 class Force(Strict):
@@ -326,11 +359,24 @@ class MeasuredCurve(MeasuredColumns):
     """
 
     type: Literal["curve"] = "curve"
-    quantity: Literal["force"] | AnyGauge = "force"
-    against: Literal["displacement", "time", "opening"] | AnyGauge = "displacement"
+    quantity: Annotated[
+        Annotated[Literal["force"], Tag(AS_WORD)] | Annotated[AnyGauge, Tag(AS_PART)],
+        _word_or(AS_PART),
+    ] = "force"
+    against: Annotated[
+        Annotated[Literal["displacement", "time", "opening"], Tag(AS_WORD)]
+        | Annotated[AnyGauge, Tag(AS_PART)],
+        _word_or(AS_PART),
+    ] = "displacement"
     group: Annotated[int, Field(ge=0)] | None = None
     load: Annotated[int, Field(ge=0)] | None = None
-    axis: Literal["x", "y"] | Toward | None = None
+    axis: (
+        Annotated[
+            Annotated[Literal["x", "y"], Tag(AS_WORD)] | Annotated[Toward, Tag(AS_LIST)],
+            _word_or(AS_LIST),
+        ]
+        | None
+    ) = None
     thickness: Positive | None = None
     youngs_modulus: Positive | None = None
     columns: Annotated[tuple[str, str], Field(strict=False)] = ("displacement", "force")
@@ -342,6 +388,9 @@ class MeasuredCurve(MeasuredColumns):
             raise fault("the curve has a `group` and a `load`; give one of them", key="load")
         if needs and self.group is None and self.load is None:
             raise fault("is missing; give the `group` or the `load` of the force", key="group")
+        for key in ("thickness", "youngs_modulus"):
+            if getattr(self, key) and not self.measures_force:
+                raise fault("converts forces, but a gauge is measured; remove it", key=key)
         if isinstance(self.axis, tuple) and not any(self.axis):
             raise fault("the axis is a zero vector; give one, such as [1, 0]", key="axis")
         return self
@@ -465,7 +514,10 @@ def _in_one_unit(bounds: tuple[str, str]) -> tuple[str, str]:
 
 Bounds = Annotated[Pair, AfterValidator(_two)]
 UnitBounds = Annotated[tuple[str, str], Field(strict=False), AfterValidator(_in_one_unit)]
-AnyBounds = Bounds | UnitBounds
+AnyBounds = Annotated[
+    Annotated[Bounds, Tag(PLAIN)] | Annotated[UnitBounds, Tag(WITH_UNITS)],
+    Discriminator(lambda value: WITH_UNITS if _has_text(value) else PLAIN),
+]
 """Type of bounds: two numbers, or two texts with a unit."""
 
 
@@ -516,8 +568,8 @@ class Fit(Strict):
     """Fits the `unknown` parameters of an experiment, within bounds, to one or several
     measurements, which are fields in equilibrium, tracks or curves.
 
-    Bounds are numbers as in the experiment or, with `units`, texts such as 2 MPa. Without unknown
-    parameters, Young's modulus alone is fitted.
+    Bounds are numbers as in the experiment or, with `units`, texts such as 2 MPa. `unknown` can be
+    empty if Young's modulus, `derived` quantities or a `crack_tip` are determined.
 
     If a leader group has the motion `measured`, its displacement along each axis is a sum of
     `modes` smooth functions with amplitudes that are also fitted. By default, `auto`, the data
@@ -547,7 +599,7 @@ class Fit(Strict):
     measured: Measurements
     specimens: bool = False
     force: Force | None = None
-    modes: Count | Annotated[tuple[Count, ...], Field(strict=False)] = "auto"
+    modes: Counts = "auto"
     loss: Loss = "linear"
     profile: Annotated[tuple[str, ...], Field(strict=False)] = ()
     sampler: Sampler | None = None

@@ -76,7 +76,7 @@ class FittedNumbers:
     Parameters
     ----------
     along : array of float, shape (number,)
-        Time or displacement.
+        Abscissae: times, displacements, openings or values of a gauge.
     measured, fitted, residual : array of float, shape (number,)
         Measured and fitted values, and the differences between them.
     what, over : str
@@ -287,13 +287,20 @@ class Fitted:
 
     @property
     def warnings(self) -> tuple[WarningText, ...]:
-        """Warnings of measurements with residuals well above the noise."""
+        """Warnings of residuals well above the noise, and of an end at kinks of the prediction."""
         several = len(self.misfits) > 1
-        return tuple(
-            WarningText(_excess_text(misfit, n, several), AccuracyWarning)
+        texts = [
+            _excess_text(misfit, n, several)
             for n, misfit in enumerate(self.misfits)
             if misfit.exceeds_noise
-        )
+        ]
+        if self.solution.is_stalled:
+            texts.append(
+                f"no step reduces the residuals, although {self.solution.remaining:.1f} standard "
+                "errors remain, because the curve has kinks where cells begin to soften; fewer "
+                "steps of the experiment make it smoother"
+            )
+        return tuple(WarningText(text, AccuracyWarning) for text in texts)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the result as plain values, for JSON.
@@ -507,8 +514,8 @@ class Fitted:
             if counts := self.modes(n):
                 each = ", ".join(f"{count} of group {group}" for group, count in counts.items())
                 yield f"modes of measured boundaries: {each}"
-        if any(misfit.correlation for misfit in self.misfits):
-            yield f"the correlation increases standard errors: {', '.join(self._growths())}"
+        if any(misfit.correlation for misfit in self.misfits) and (growths := [*self._growths()]):
+            yield f"the correlation increases standard errors: {', '.join(growths)}"
         for path, profile in self.profiles.items():
             yield f"{path}: {profile}, by its profile"
         if self.sample:
@@ -519,8 +526,9 @@ class Fitted:
 
     def _growths(self) -> Iterator[str]:
         modulus = {MODULUS: self.youngs_modulus} if self.youngs_modulus else {}
-        for name, estimate in (dict(self.values) | modulus).items():
-            if estimate.identifiable:
+        derived = {name: quantity.estimate for name, quantity in self.derived.items()}
+        for name, estimate in (dict(self.values) | modulus | derived).items():
+            if estimate.identifiable and np.isfinite(estimate.value):
                 yield f"{name} by a factor of {estimate.growth:.2f}"
 
 
@@ -581,8 +589,8 @@ def _correlation_of(
     components = len(observation.measured) // len(places)
     units = observation.experiment.units
     factor, unit = (units.length_mm, LENGTH.unit) if units else (1.0, "")
-    if isinstance(observation, CurveObservation) and observation.at_times:
-        factor, unit = 1.0, "steps"
+    if isinstance(observation, CurveObservation) and observation.over.quantity is not LENGTH:
+        factor, unit = 1.0, "steps" * observation.at_times
     return ResidualCorrelation(
         factor * correlation.length,
         correlation.share,

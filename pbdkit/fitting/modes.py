@@ -52,6 +52,8 @@ def solve(problem: Problem, start: Floats, loss: Loss) -> tuple[Problem, Solutio
         # The cost has several minima; that of a convex loss is near the lowest one.
         start = solved(problem, start, "soft_l1").z
     solution = solved(problem, start, loss)
+    if not any(boundary.is_automatic for boundary in _boundaries(problem)):
+        return problem, solution
     for _ in range(MAX_CHOICES):
         changed, start = choose_modes(problem, solution.z, loss)
         if _counts(changed) == _counts(problem):

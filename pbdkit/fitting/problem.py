@@ -12,7 +12,6 @@ be far from the solution.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -24,7 +23,7 @@ from numpy.typing import NDArray
 from pbdkit.array_types import Floats
 from pbdkit.equilibrium.error_bound import UnconvergedError
 from pbdkit.equilibrium.system import Moves
-from pbdkit.errors import AccuracyWarning, ExperimentError
+from pbdkit.errors import ExperimentError
 from pbdkit.fitting.correlation import Correlation, estimate_correlation, is_correlated
 from pbdkit.fitting.observations import FieldObservation, NearbyPrediction, Observation, Prediction
 from pbdkit.fitting.parameter import Parameter
@@ -392,7 +391,7 @@ class Problem:
             jacobian[rows, section] = prediction.by_own
             if self.with_modulus:
                 jacobian[rows, len(parameters)] = prediction.by_modulus
-        self._in_units(jacobian, z)
+        self.convert_to_units(jacobian, z)
         return Linearisation(z, residuals, jacobian, tuple(predictions), self._scales)
 
     @cached_property
@@ -400,9 +399,9 @@ class Problem:
         """Return whether numbers of the experiment depend on an unknown Young's modulus."""
         return self.with_modulus and any(u.modulus is not None for u in self.unknowns)
 
-    def _in_units(self, jacobian: Floats, z: Floats) -> None:
+    def convert_to_units(self, jacobian: Floats, z: Floats) -> None:
         """Convert derivatives with respect to numbers of the experiment to those with respect to
-        values in units, in place.
+        values in units, (row, unknown), in place.
 
         If such a value is a stress or a force, the number of the experiment is its quotient by
         Young's modulus, so that it changes with an unknown modulus too.
@@ -469,7 +468,8 @@ STALLED = 0.5
 cost.
 
 The cost then has a kink: where bonds are broken, the stiffness of cells is not a smooth function of
-the parameters of `orthotropic`.
+the parameters of `orthotropic`. Derivatives of predictions that are not smooth are averages over a
+range of about this size.
 """
 
 SLACK = 1e-9
@@ -501,9 +501,6 @@ CONVERGED = 1e-2
 """Largest step, in standard errors, of a converged fit."""
 CONVERGED_SECANT = 0.15
 """Largest step of a converged fit of predictions that are not smooth."""
-STALLED_SECANT = 0.5
-"""Value of `STALLED` for predictions that are not smooth. Their derivatives are averages over a
-range of about this size."""
 KINK = 0.5
 """Increase of the cost that is accepted for predictions that are not smooth, in units of the mean
 square residual. The cost has local minima of about this depth, and the fit is where the projection
@@ -620,6 +617,8 @@ class Solution:
         the residuals were not tested.
     independent
         Directions with the variance for independent residuals, if a correlation is significant.
+    remaining
+        Component of the remaining step, in standard errors, along the direction with the largest.
     """
 
     z: Floats
@@ -631,6 +630,12 @@ class Solution:
     evaluations: int
     correlations: tuple[Correlation | None, ...] = ()
     independent: Directions | None = None
+    remaining: float = 0.0
+
+    @property
+    def is_stalled(self) -> bool:
+        """Return whether a fit of predictions that are not smooth ends far from its next step."""
+        return self.remaining > STALLED
 
     @cached_property
     def covariance(self) -> Floats:
@@ -651,7 +656,7 @@ class Solution:
 
 
 def solved(problem: Problem, start: Floats, loss: Loss = "linear") -> Solution:
-    """Solve the problem by Gauss-Newton iterations in a trust region, with exact derivatives.
+    """Solve the problem by Gauss-Newton iterations in a trust region.
 
     In each iteration the linearised problem with its loss is solved between the bounds and within
     the trust region of the parameters. The iteration ends when z has converged along all
@@ -696,16 +701,18 @@ def solved(problem: Problem, start: Floats, loss: Loss = "linear") -> Solution:
         at = trial
     if remaining > (STALLED if problem.is_smooth else MAX_STALLED_SECANT):
         raise UnconvergedError(region.explain(at))
-    if not problem.is_smooth and remaining > STALLED_SECANT:
-        warnings.warn(
-            f"the fit ends {remaining:.1f} standard errors from its last step, because the curve "
-            "has kinks where cells begin to soften; fewer steps make it smoother",
-            AccuracyWarning,
-            stacklevel=2,
-        )
     ratio = spread_of(at.residuals, problem.size, loss)
     on_bounds = _on_bounds(problem, at.z)
-    return Solution(at.z, at, directions, ratio, unidentified, on_bounds, region.evaluations)
+    return Solution(
+        at.z,
+        at,
+        directions,
+        ratio,
+        unidentified,
+        on_bounds,
+        region.evaluations,
+        remaining=float(remaining),
+    )
 
 
 @dataclass

@@ -110,17 +110,18 @@ def _distortion(observation: FieldObservation, values: Floats) -> str:
     columns = np.stack([x**p * y**q for p, q in powers], axis=1)
     named: list[str] = []
     explained = 0.0
-    for axis, column in zip(("ux", "uy"), values.reshape(2, -1), strict=True):
+    axes = observation.evidence.axes
+    for axis, column in zip(axes, values.reshape(len(axes), -1), strict=True):
         amplitudes, *_ = np.linalg.lstsq(columns, column, rcond=None)
         explained += np.square(columns @ amplitudes).sum()
         sizes = np.square(columns * amplitudes).sum(axis=0)
-        known = observation.evidence.terms[0 if axis == "ux" else 1]
+        known = observation.evidence.terms[axis]
         terms = [
             list(powers[n])
             for n in np.argsort(-sizes)[:2]
             if sizes[n] > TERM_SHARE * np.square(values).sum() and powers[n] not in known
         ]
-        named += [f"{axis}: {terms}"] if terms else []
+        named += [f"u{'xy'[axis]}: {terms}"] if terms else []
     share = explained / np.square(values).sum()
     if share < SMOOTH or not named:
         return ""
@@ -132,7 +133,7 @@ def _distortion(observation: FieldObservation, values: Floats) -> str:
 
 def _boundary(observation: FieldObservation, values: Floats) -> str:
     """Compare the residuals beside each measured boundary with all others."""
-    squares = np.square(values.reshape(2, -1)).mean(axis=0)
+    squares = np.square(values.reshape(len(observation.evidence.axes), -1)).mean(axis=0)
     reach = BESIDE * np.abs(np.array(observation.scene.raster.cell.vectors)).max()
     for boundary in observation.boundaries:
         distances, _ = KDTree(boundary.leading.reference).query(observation.evidence.points)

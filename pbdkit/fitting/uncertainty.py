@@ -166,7 +166,8 @@ def reaction_along(force: Force, problem: Problem, solution: Solution) -> tuple[
     reaction = GroupReaction(prediction.resting_scene, force.group)
     unit, gradient = float(direction @ reaction.predicted), np.zeros(problem.size)
     for n, (du, unknown) in enumerate(zip(prediction.changes, problem.unknowns, strict=True)):
-        gradient[n] = unknown.scale * (direction @ reaction.change(du, unknown.parameter))
+        gradient[n] = direction @ reaction.change(du, unknown.parameter)
+    problem.convert_to_units(gradient[None], solution.z)
     reaction = GroupReaction(
         prediction.answering, force.group
     )  # The responses to boundary modes are those at this state.

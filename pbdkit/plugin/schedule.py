@@ -28,8 +28,18 @@ BY_NAME = "by name"
 """Form, in messages, of a law that is given by its name."""
 BY_POINTS = "by points"
 """Form, in messages, of a law that is given by points."""
-FORMS = (PLAIN, TIME_DEPENDENT, WORD, BY_NAME, BY_POINTS)
-"""Forms of numbers and laws in messages."""
+AS_WORD = "as a word"
+"""Form, in the messages of pydantic, of a value that can also be a list, a number or a part."""
+AS_LIST = "as a list"
+"""Form, in the messages of pydantic, of a list in place of a single value."""
+AS_PART = "as a part"
+"""Form, in the messages of pydantic, of a part with keys in place of a word."""
+WITH_UNITS = "with units"
+"""Form, in the messages of pydantic, of numbers with units."""
+FORMS = (
+    PLAIN, TIME_DEPENDENT, WORD, BY_NAME, BY_POINTS, AS_WORD, AS_LIST, AS_PART, WITH_UNITS,
+)  # fmt: skip
+"""Forms of values in messages."""
 
 
 class TimeDependent(Strict, Generic[Value]):

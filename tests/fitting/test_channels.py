@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -108,6 +109,51 @@ def test_modulus_alone_from_force_over_a_gauge_in_any_direction(tmp_path):
     assert "Young's modulus: 2000" in str(result)
     with pytest.raises(pbdkit.ExperimentError, match="there is nothing to fit"):
         pbdkit.fit(fit | {"measured": measured | {"youngs_modulus": 1.0}})
+
+
+def test_length_of_the_correlation_has_the_unit_of_the_abscissa(tmp_path):
+    axial = np.linspace(0.0005, 0.019, 40)
+    smooth = np.convolve(np.random.default_rng(0).normal(size=48), np.ones(9), "valid")
+    force = MODULUS * THICKNESS * HEIGHT * axial + smooth
+    measured = {"type": "curve", "columns": ["at", "force"], "group": 2}
+    units = {}
+    for name, against, places in (
+        ("strain", gauge(angle=0.0), axial),
+        ("displacement", "displacement", LENGTH * axial),
+        ("time", "time", 200.0 * axial),
+    ):
+        file = written(tmp_path / f"{name}.csv", "at,force", places, force)
+        given = measured | {"file": file, "against": against}
+        result = pbdkit.fit({"experiment": bar(), "unknown": {}, "measured": given})
+        units[name] = result.misfits[0].correlation.unit
+    assert units == {"strain": "", "displacement": "mm", "time": "steps"}
+
+
+UNCLEAR = {
+    "bounds": ({"unknown": {"rule.poisson_ratio": [0.4, 0.1]}}, "unknown.rule.poisson_ratio: exp"),
+    "modes": ({"modes": "aut"}, "modes: should be a number or 'auto'"),
+    "count": ({"modes": [1, "two"]}, "modes.1: should be a number or 'auto'"),
+    "axis": ({"measured": {"axis": "z"}}, "measured.axis: should be 'x' or 'y'"),
+    "against": ({"measured": {"against": "openin"}}, "measured.against: .*did you mean 'opening'"),
+    "gauge": ({"measured": {"against": {"type": "strain"}}}, "measured.against.type: unknown type"),
+    "thickness": (
+        {"measured": {"quantity": gauge(), "thickness": 2.0}},
+        "measured.thickness: converts forces, but a gauge is measured; remove it",
+    ),
+    "axes": ({"measured": {"axes": ["y", "x"]}}, r"measured.axes: expected \[x\], \[y\] or \[x, y"),
+}
+
+
+@pytest.mark.parametrize("name", UNCLEAR)
+def test_faulty_keys_are_reported_in_one_line(name, tmp_path):
+    parts, message = UNCLEAR[name]
+    file = written(tmp_path / "curve.csv", "displacement,force", [1.0, 2.0], [1.0, 2.0])
+    measured = {"file": file} | ({} if name == "axes" else {"type": "curve", "group": 2})
+    given = {"experiment": bar(), "unknown": {}} | parts
+    given["measured"] = measured | parts.get("measured", {})
+    with pytest.raises(pbdkit.ExperimentError, match=f"fit: {message}") as error:
+        pbdkit.fit(given)
+    assert len(str(error.value).splitlines()) == 1
 
 
 def test_ratio_from_strain_gauges_and_an_extensometer(tmp_path):
@@ -278,6 +324,10 @@ def test_kink_of_the_softening_law(softening):
     result = pbdkit.fit({"experiment": strip(), "unknown": unknown, "measured": measured})
     estimate = result.values["fracture.law.1.1"]
     assert estimate.value == pytest.approx(0.4, abs=max(0.2 * estimate.error, 1e-3))
+    assert result.warnings == ()
+    stalled = replace(result, solution=replace(result.solution, remaining=0.8))
+    (warning,) = stalled.as_dict()["warnings"]
+    assert warning.startswith("no step reduces the residuals, although 0.8 standard errors remain")
 
 
 def test_derivatives_with_an_unknown_modulus(softening):

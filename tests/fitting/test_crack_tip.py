@@ -126,6 +126,16 @@ def test_intensities_are_those_of_the_field(fitted):
     assert abs(stress.value - 3300.0 * T) < 2.5 * stress.error
 
 
+def test_settings_of_the_measurement_move_the_cut(fitted, tmp_path):
+    file = tmp_path / "field.csv"
+    write_field(file, MIDDLE + 0.3)
+    measured = {"file": str(file), "noise": NOISE, "settings": {"cuts.0.to": [10.0, MIDDLE]}}
+    cut = {"from": [-1.0, MIDDLE], "to": [3.0, MIDDLE]}
+    moved = pbdkit.fit(description(file, cut, measured=measured))
+    assert moved.crack_tip == fitted.crack_tip
+    assert moved.experiment.cuts == fitted.experiment.cuts
+
+
 def test_fitted_experiment_has_the_crack_that_was_found(fitted):
     assert fitted.experiment.cuts[0].to == fitted.crack_tip.cut_end
     end = fitted.dataset.isel(time=-1)

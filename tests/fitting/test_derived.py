@@ -6,6 +6,7 @@ import json
 
 import numpy as np
 import pytest
+from fitting.test_channels import bar, written
 from fitting.test_fit import NOISE, measured, plate
 
 import pbdkit
@@ -70,6 +71,40 @@ def test_errors_of_formulas_are_those_of_the_linearised_formula(fitted):
     of_log = -gradient / reaction - np.eye(len(gradient))[0] / (1 + ratio.value)
     variance = of_log @ fitted.solution.covariance @ of_log + (2.0 / 100.0) ** 2
     assert shear.error / shear.value == pytest.approx(np.sqrt(variance), rel=1e-9)
+
+
+def test_gradients_of_a_force_in_units_with_an_unknown_modulus(tmp_path):
+    """The number of the experiment is the force divided by the modulus, as is the reaction."""
+    body = bar(
+        units={"length": "1 mm", "thickness": "5 mm", "youngs_modulus": "2000 MPa"},
+        leaders=bar()["leaders"][:2],
+        loads=[{"select": {"edge": "right"}, "force": ["400 N", "0 N"]}],
+        steps=1,
+        diagnostics=[{"type": "reaction"}],
+    )
+    ds = pbdkit.run(body, progress=False).isel(time=-1)
+    u = (ds.position - ds.reference).values
+    noise = 1e-4 * np.random.default_rng(1).normal(size=u.shape)
+    end = u[ds.reference.values[:, 0] == 12.0, 0].mean()
+    field = written(tmp_path / "f.csv", "x,y,ux,uy", *ds.reference.values.T, *(u + noise).T)
+    curve = written(
+        tmp_path / "c.csv", "displacement,force", [0.3 * end, 0.6 * end], [110.0, 250.0]
+    )
+    fit = {
+        "experiment": body,
+        "unknown": {"loads.0.force.0": ["100 N", "900 N"]},
+        "measured": [
+            {"file": field, "noise": 1e-4},
+            {"type": "curve", "file": curve, "load": 0, "noise": 10.0},
+        ],
+        "derived": ["reaction[0, 0]"],
+    }
+    result = pbdkit.fit(fit)
+    force, modulus = result.solution.z[:2]
+    response = Response(result.solution.at.predictions[0], result.problem, result.solution)
+    (values,), (gradients,) = response.of(result.experiment.diagnostics[0])
+    expected = values[0, 0] * np.array([1.0 / force, -1.0 / modulus])
+    np.testing.assert_allclose(gradients[0, 0], expected, rtol=1e-4)
 
 
 def test_diagnostics_are_those_of_the_fitted_body(fitted):

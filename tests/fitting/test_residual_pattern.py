@@ -57,6 +57,19 @@ def test_remedy_follows_from_the_pattern(name, field):
     assert re.search(remedy, text), text
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+def test_remedy_of_a_field_of_one_component(axis, field):
+    scene, points = field.scene, field.evidence.points[:301]
+    evidence = FieldEvidence.of(scene, points, np.zeros((301, 1)), axes=(axis,))
+    observation = FieldObservation.of(scene, evidence, 1e-3, modes=4)
+    x, y = (evidence.points / [WIDTH / 2, HEIGHT / 2] - 1.0).T
+    noise = np.random.default_rng(6).uniform(-1.7, 1.7, len(x))
+    smooth = remedy_of([observation], [noise + 9.0 * x**2], "linear")
+    assert f"distortion: {{u{'xy'[axis]}: [[2, 0]" in smooth
+    excess = np.where(x > 0.85, 40.0 * np.sign(np.sin(9.0 * y)), 1.0)
+    assert "beside leader group 1" in remedy_of([observation], [noise * excess], "linear")
+
+
 def test_fit_that_stops_names_values_and_remedy(field, monkeypatch):
     """Derivatives of the opposite sign: no step reduces the cost."""
     problem = Problem((Unknown(Parameter("rule.poisson_ratio"), 0.0, 0.49),), (field,))
