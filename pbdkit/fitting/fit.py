@@ -352,6 +352,7 @@ def _solve(problem: Problem, fit: Fit) -> tuple[Problem, Solution]:
         problem, observations=(observation.with_noise(TINY * _size(observation.measured)),)
     )
     problem, solution = solve(problem, problem.start(), "linear")
+    _redundancies(problem, solution, unknown)
     # A robust loss identifies outliers by means of the noise, so that the fit and the noise are
     # computed twice.
     for _ in range(1 if fit.loss == "linear" else 2):
@@ -386,7 +387,7 @@ def _solve_for_noises(
     for _ in range(MAX_NOISE_ITERATIONS):
         problem = _with_noises(problem, noises)
         problem, solution = solve(problem, problem.start() if z is None else z, fit.loss)
-        ratios, previous = _noise_ratios(problem, solution, fit.loss), noises
+        ratios, previous = _noise_ratios(problem, solution, fit.loss, unknown), noises
         noises = {n: max(ratios[n] * previous[n], TINY * sizes[n]) for n in unknown}
         if max(abs(np.log(noises[n] / previous[n])) for n in unknown) <= NOISE_RTOL:
             return problem, solution
@@ -405,29 +406,40 @@ def _with_noises(problem: Problem, noises: Mapping[int, float]) -> Problem:
     return replace(problem, observations=tuple(observations))
 
 
-def _noise_ratios(problem: Problem, solution: Solution, loss: Loss) -> list[float]:
-    """Return the standard deviation of the residuals of each measurement, over its noise.
+def _noise_ratios(
+    problem: Problem, solution: Solution, loss: Loss, unknown: Sequence[int]
+) -> dict[int, float]:
+    """Return the standard deviation of the residuals of some measurements, over their noise."""
+    ratios, parts = dict[int, float](), [*problem.rows()]
+    for n, redundancy in _redundancies(problem, solution, unknown).items():
+        observation, rows = parts[n]
+        residuals = solution.at.residuals[rows] / np.sqrt(observation.weight)
+        spread = spread_of(residuals, 0, loss)
+        scale = np.sqrt(len(residuals) / redundancy) if loss == "linear" else 1.0
+        ratios[n] = float(spread * scale)
+    return ratios
+
+
+def _redundancies(problem: Problem, solution: Solution, unknown: Sequence[int]) -> dict[int, float]:
+    """Return the number of values of some measurements minus that of the unknowns which they
+    determine.
 
     Raises
     ------
     ExperimentError
         If the unknowns adapt to all values of a measurement.
     """
-    linearisation, ratios = solution.at, list[float]()
-    hat = hat_diagonal(linearisation.jacobian)
-    for n, (observation, rows) in enumerate(problem.rows()):
-        residuals = linearisation.residuals[rows] / np.sqrt(observation.weight)
-        redundancy = len(residuals) - float(hat[rows].sum())
-        if redundancy < MIN_REDUNDANCY:
+    hat, redundancies = hat_diagonal(solution.at.jacobian), dict[int, float]()
+    parts = [hat[rows] for _, rows in problem.rows()]
+    for n in unknown:
+        redundancies[n] = len(parts[n]) - float(parts[n].sum())
+        if redundancies[n] < MIN_REDUNDANCY:
             raise ExperimentError(
-                f"the {len(residuals)} values of measurement {n} determine {hat[rows].sum():.1f} "
+                f"the {len(parts[n])} values of measurement {n} determine {parts[n].sum():.1f} "
                 "unknowns, so that their noise cannot be estimated; give its `noise`",
                 ("measured",),
             )
-        spread = spread_of(residuals, 0, loss)
-        scale = np.sqrt(len(residuals) / redundancy) if loss == "linear" else 1.0
-        ratios.append(float(spread * scale))
-    return ratios
+    return redundancies
 
 
 def _size(measured: Floats) -> float:

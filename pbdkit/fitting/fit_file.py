@@ -626,6 +626,8 @@ class Fit(Strict):
             raise ValueError(f"`profile` names '{invalid[0]}', which is not unknown{hint}")
         if self.sampler and self.loss != "linear":
             raise ValueError("a `sampler` assumes normal noise; set `loss: linear`")
+        if self.sampler and not self.unknown:
+            raise ValueError("a `sampler` requires `unknown` parameters; omit it, or give some")
         if self.sampler and self.sampler.walkers < 2 * len(self.unknown):
             raise ValueError("a `sampler` requires at least two walkers for each parameter")
         return self

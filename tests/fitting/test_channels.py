@@ -129,7 +129,24 @@ def test_length_of_the_correlation_has_the_unit_of_the_abscissa(tmp_path):
     assert units == {"strain": "", "displacement": "mm", "time": "steps"}
 
 
+def test_noise_is_not_estimated_from_as_many_values_as_unknowns(tmp_path):
+    file = written(tmp_path / "curve.csv", "displacement,force", [0.1], [300.0])
+    measured = {"type": "curve", "file": file, "group": 2}
+    fit = {"experiment": bar(), "unknown": {}, "measured": measured}
+    with pytest.raises(pbdkit.ExperimentError, match="noise cannot be estimated; give its `noise`"):
+        pbdkit.fit(fit)
+    modulus = pbdkit.fit(fit | {"measured": measured | {"noise": 3.0}}).youngs_modulus
+    assert modulus.error == pytest.approx(0.01 * modulus.value, rel=1e-6)
+    noise = np.array([2e-6, 0.0, -1e-6, 0.0])
+    strains = written(tmp_path / "s.csv", "at,s", 12 * AXIAL[1:], AXIAL[1:] + noise)
+    second = {"type": "curve", "file": strains, "group": 2, "columns": ["at", "s"]}
+    second |= {"quantity": gauge(angle=0.0)}
+    both = pbdkit.fit(fit | {"measured": [measured | {"noise": 3.0}, second]})
+    assert both.youngs_modulus.error == pytest.approx(modulus.error, rel=1e-6)
+
+
 UNCLEAR = {
+    "sampler": ({"sampler": {}}, "a `sampler` requires `unknown` parameters"),
     "bounds": ({"unknown": {"rule.poisson_ratio": [0.4, 0.1]}}, "unknown.rule.poisson_ratio: exp"),
     "modes": ({"modes": "aut"}, "modes: should be a number or 'auto'"),
     "count": ({"modes": [1, "two"]}, "modes.1: should be a number or 'auto'"),
