@@ -336,6 +336,8 @@ def fits(features: Features) -> bool:
     pushes = any(f.startswith(("obstacles", "leaders.axes", *NEWTON)) for f in features)
     if "solver.engine: compiled" in features and ((in_time and varies) or (changes and pushes)):
         return False  # kernels have one of both
+    if features >= {"solver.engine: compiled", "rule in time"} and rule == "springs":
+        return False  # its stiffness is a constant of kernels
     if features >= {"solver in time", "solver.memory", "solver.relaxation"}:
         return False
     several = ("leaders.motion: ", "obstacles.shape: ", "obstacles.motion: ", "regions: ")
