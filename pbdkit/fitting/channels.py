@@ -26,8 +26,10 @@ from pbdkit.stepping.state import State
 class Channel(ABC):
     """A number that is measured in each state."""
 
-    quantity: ClassVar[Quantity | None] = None
-    """Quantity of the number; None if it has no dimension."""
+    @property
+    def quantity(self) -> Quantity | None:
+        """Quantity of the number; None if it has no dimension."""
+        return None
 
     @property
     @abstractmethod
@@ -57,82 +59,77 @@ class Time(Channel):
 
 
 @dataclass(frozen=True)
-class GroupForce(Channel):
-    """Force that a leader group exerts along a direction."""
+class DirectedChannel(Channel):
+    """Component, along a direction, of a vector that belongs to a leader group or to a load.
 
-    quantity = FORCE
-    group: int
+    Parameters
+    ----------
+    number
+        Index of the group or of the load.
+    direction
+        Unit vector.
+    """
+
+    number: int
     direction: tuple[float, float]
+    name: ClassVar[str]
 
     @property
     def label(self) -> str:
-        """Label with the index of the group."""
-        return f"force on group {self.group}"
+        """Name with the index."""
+        return f"{self.name} {self.number}"
 
     def read(self, time: float, state: State, tables: Tables) -> float:
-        """Return the component of the reaction of the group."""
-        moment = StateMoment(state, tables)
-        return float(np.dot(self.direction, reactions(moment)[self.group]))
-
-
-@dataclass(frozen=True)
-class LoadForce(Channel):
-    """Component of a load along a direction."""
-
-    quantity = FORCE
-    load: int
-    direction: tuple[float, float]
-
-    @property
-    def label(self) -> str:
-        """Label with the index of the load."""
-        return f"load {self.load}"
-
-    def read(self, time: float, state: State, tables: Tables) -> float:
-        """Return the component of the resultant of the load."""
-        rows = StateMoment(state, tables, time=time).loads()[self.load]
-        return float(rows.share.sum() * np.dot(self.direction, rows.force))
-
-
-@dataclass(frozen=True)
-class GroupDisplacement(Channel):
-    """Mean displacement of a leader group along a direction."""
-
-    quantity = LENGTH
-    group: int
-    direction: tuple[float, float]
-
-    @property
-    def label(self) -> str:
-        """Label with the index of the group."""
-        return f"displacement of group {self.group}"
-
-    def read(self, time: float, state: State, tables: Tables) -> float:
-        """Return the mean displacement of the particles of the group."""
-        place = tables.scene.leading[self.group].place
-        flat = state.u.reshape(len(state.u), -1)[:, place]
-        return float(np.dot(self.direction, flat.mean(axis=1)))
-
-
-@dataclass(frozen=True)
-class LoadDisplacement(Channel):
-    """Mean displacement of the particles of a load along a direction, weighted by their shares."""
-
-    quantity = LENGTH
-    load: int
-    direction: tuple[float, float]
-
-    @property
-    def label(self) -> str:
-        """Label with the index of the load."""
-        return f"displacement of load {self.load}"
-
-    def read(self, time: float, state: State, tables: Tables) -> float:
-        """Return the weighted mean displacement."""
+        """Return the component of the vector."""
         moment = StateMoment(state, tables, time=time)
-        rows = moment.loads()[self.load]
-        mean = rows.share @ moment.displacement(rows.rows) / rows.share.sum()
-        return float(np.dot(self.direction, mean))
+        return float(np.dot(self.direction, self.vector(moment, tables)))
+
+    @abstractmethod
+    def vector(self, moment: StateMoment, tables: Tables) -> Floats:
+        """Return the vector, (axis,)."""
+
+
+class GroupForce(DirectedChannel):
+    """Force that a leader group exerts."""
+
+    quantity, name = FORCE, "force on group"
+
+    def vector(self, moment: StateMoment, tables: Tables) -> Floats:
+        """Return the reaction of the group."""
+        return np.asarray(reactions(moment)[self.number])
+
+
+class LoadForce(DirectedChannel):
+    """Resultant of a load."""
+
+    quantity, name = FORCE, "load"
+
+    def vector(self, moment: StateMoment, tables: Tables) -> Floats:
+        """Return the resultant of the load."""
+        rows = moment.loads()[self.number]
+        return np.asarray(rows.share.sum() * np.asarray(rows.force))
+
+
+class GroupDisplacement(DirectedChannel):
+    """Mean displacement of the particles of a leader group."""
+
+    quantity, name = LENGTH, "displacement of group"
+
+    def vector(self, moment: StateMoment, tables: Tables) -> Floats:
+        """Return the mean displacement."""
+        rows = tables.scene.leading[self.number].rows
+        return np.asarray(moment.displacement(rows).mean(axis=0))
+
+
+class LoadDisplacement(DirectedChannel):
+    """Mean displacement of the particles of a load, weighted by their shares."""
+
+    quantity, name = LENGTH, "displacement of load"
+
+    def vector(self, moment: StateMoment, tables: Tables) -> Floats:
+        """Return the weighted mean displacement."""
+        rows = moment.loads()[self.number]
+        return np.asarray(rows.share @ moment.displacement(rows.rows) / rows.share.sum())
 
 
 @dataclass(frozen=True)
@@ -142,7 +139,7 @@ class GaugeReading(Channel):
     gauge: Gauge
 
     @property
-    def quantity(self) -> Quantity | None:  # type: ignore[override]  # depends on the gauge
+    def quantity(self) -> Quantity | None:
         """Length of an extensometer; a strain has no dimension."""
         return LENGTH if isinstance(self.gauge, Extensometer) else None
 
