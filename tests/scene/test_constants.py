@@ -171,30 +171,33 @@ class Writing(pbdkit.plugin.RenewsBonds, Keeping):
         (Worded, "'the age' is not a valid name of a variable; use letters, digits and _"),
         (Typed, "'age' has the dtype 'f4'; expected one of f8, i1, i2, i4, i8"),
         (Generous, "it returned 2 values for 1 changing state variables; declare `changes=False`"),
-        (Bare, "step 1: `update` returned ndarray, not a tuple; write `\\(value,\\)`"),
+        (Bare, "in `update` for .*: `update` returned ndarray, not a tuple; write `\\(value,\\)`"),
         (Loose, "to declare its remembered numbers: `remembered` returned Remembered, not a tuple"),
         (
             Tangled,
-            "'tangled' failed to place .*: `fictitious` returned tuple; return a vector, as",
+            "'tangled' failed .* in `fictitious` for .*: `fictitious` returned tuple; return a vec",
         ),
         (
             Measured,
             (
-                "'plain' failed at step 1: `breaks` returned float64, not booleans; return a "
-                "comparison, as in"
+                "'plain' failed .* in `breaks` for .*: `breaks` returned float64, not booleans; "
+                "return a comparison, as in"
             ),
         ),
         (
             Silent,
             (
-                "'plain' failed at step 1: `breaks` returned None, not booleans; return a "
-                "comparison, as in"
+                "'plain' failed .* in `breaks` for .*: `breaks` returned None, not booleans; "
+                "return a comparison, as in"
             ),
         ),
-        (Misshapen, "'plain' failed at step 1: ValueError: operands could not be broadcast"),
+        (
+            Misshapen,
+            r"`breaks` for .* returned the shape \(63,\) for 64 bonds, in its value; return",
+        ),
         (Constant, "to return its constants: TypeError: it returned float; return numbers by name"),
-        (Fractional, "failed at step 1.*same_kind"),
-        (Writing, "failed at step 1.*read-only"),
+        (Fractional, "beginning of the run in `update`.*same_kind"),
+        (Writing, "`update` for bonds .* writes into its arguments; make new arrays"),
     ],
 )
 def test_component_that_violates_the_interface(model, message):
