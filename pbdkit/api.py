@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from pbdkit.fitting.strength import FittedStrength
     from pbdkit.identification.identity import Identity
     from pbdkit.model.loading import ComponentClasses, ExperimentLike
-    from pbdkit.model.reading import Settings, Source
+    from pbdkit.model.reading import Settings
     from pbdkit.stability.analysis import Analysis
 
 
@@ -505,13 +505,16 @@ def fit(
                 "`measured` of the fit"
             )
         return fit_strength(description, experiment=experiment, components=components)
+    passed = None if experiment is None else as_experiment(experiment, components)
     problem, source = read_fit(
-        Fit, description, has_experiment=experiment is not None, measured=measured
+        Fit,
+        description,
+        has_experiment=passed is not None,
+        measured=measured,
+        units=passed.units if passed else None,
     )
     try:
-        fitted = fit_experiment(
-            problem, _experiment_of_fit(experiment, source, components), components
-        )
+        fitted = fit_experiment(problem, passed or Experiment.build(source, components), components)
     except UnconvergedError as error:
         raise DivergedError(str(error)) from None
     _warn(fitted.warnings)
@@ -553,18 +556,9 @@ def fit_strength(
     from pbdkit.fitting.fit_file import StrengthFit, read_fit
     from pbdkit.fitting.strength import fit_strength_of
 
-    problem, source = read_fit(StrengthFit, description, has_experiment=experiment is not None)
-    fitted = _experiment_of_fit(experiment, source, components)
+    passed = None if experiment is None else as_experiment(experiment, components)
+    problem, source = read_fit(StrengthFit, description, has_experiment=passed is not None)
     try:
-        return fit_strength_of(problem, fitted)
+        return fit_strength_of(problem, passed or Experiment.build(source, components))
     except UnconvergedError as error:
         raise DivergedError(str(error)) from None
-
-
-def _experiment_of_fit(
-    experiment: ExperimentLike | None, source: Source, components: ComponentClasses
-) -> Experiment:
-    """Return the experiment that the caller passed, or otherwise that of the fit file."""
-    if experiment is None:
-        return Experiment.build(source, components)
-    return as_experiment(experiment, components)

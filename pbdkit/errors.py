@@ -258,6 +258,14 @@ def did_you_mean(name: str, candidates: Iterable[str]) -> str:
     return f"; did you mean {first}{names[-1]}?"
 
 
+def no_such(what: str, number: int, count: int) -> str:
+    """Return the message for a number of which there is none, with the numbers that exist."""
+    numbers = {0: f"the experiment has no {what}s", 1: f"the only one has the number {count - 1}"}
+    return f"there is no {what} {number}; " + numbers.get(
+        count, f"{what}s have the numbers 0 to {count - 1}"
+    )
+
+
 class AnswerError(TypeError):
     """A function returned an object of the wrong kind. The message contains the correct kind."""
 

@@ -15,7 +15,7 @@ import numpy as np
 from pbdkit.array_types import Floats
 from pbdkit.components.diagnostics import reactions
 from pbdkit.components.gauges import Extensometer, Gauge
-from pbdkit.errors import ExperimentError
+from pbdkit.errors import ExperimentError, no_such
 from pbdkit.io.snapshot import StateMoment, Tables
 from pbdkit.model.solver import OpeningControl
 from pbdkit.plugin.units import FORCE, LENGTH, Quantity
@@ -207,7 +207,7 @@ def direction_of_load(scene: Scene, load: int) -> tuple[float, float]:
     """
     loads = scene.loads.each if scene.loads else ()
     if load >= len(loads):
-        raise ExperimentError(f"there is no load {load}", ("measured", "load"))
+        raise ExperimentError(no_such("load", load, len(loads)), ("measured", "load"))
     force: Floats = loads[load].load.force_at(scene.experiment.steps)
     if not force.any():
         raise ExperimentError(

@@ -35,7 +35,7 @@ from pbdkit.components.stress_intensity import (
     stiffness_at,
 )
 from pbdkit.equilibrium.error_bound import UnconvergedError
-from pbdkit.errors import ExperimentError
+from pbdkit.errors import ExperimentError, no_such
 from pbdkit.fitting.derived import Response
 from pbdkit.fitting.fit_file import CrackTip
 from pbdkit.fitting.observations import FieldObservation, FieldPrediction, TipFields
@@ -119,7 +119,7 @@ class CrackLine(NamedTuple):
         """
         cuts = scene.experiment.cuts
         if tip.cut >= len(cuts):
-            raise ExperimentError(f"there is no cut {tip.cut}", ("crack_tip", "cut"))
+            raise ExperimentError(no_such("cut", tip.cut, len(cuts)), ("crack_tip", "cut"))
         segment = cuts[tip.cut].segment
         start, end = map(np.array, segment if tip.end == "to" else segment[::-1])
         frame = Frame(end, (end - start) / math.dist(start, end))

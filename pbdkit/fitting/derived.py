@@ -31,6 +31,7 @@ from pbdkit.fitting.observations import DERIVATIVES, FieldObservation, FieldPred
 from pbdkit.fitting.problem import IDENTIFIABLE_RATIO, Problem, Solution
 from pbdkit.fitting.sensitivity import RestingScene, scene_like
 from pbdkit.fitting.uncertainty import Estimate, errors_of, reaction_along
+from pbdkit.io.layout import diagnostics_that_provide
 from pbdkit.io.physical import Physical
 from pbdkit.io.snapshot import StateMoment, Tables
 from pbdkit.model.experiment import Experiment
@@ -239,6 +240,8 @@ def refuse_other_names(fit: Fit, problem: Problem) -> None:
                 )
             if name not in known | variables:
                 hint = did_you_mean(name, sorted(known | variables))
+                if makers := diagnostics_that_provide({name}):
+                    hint = f"; add {' or '.join(makers)} to `diagnostics` of the experiment"
                 raise ExperimentError(
                     f"'{name}' is neither a variable of the experiment's diagnostics, nor an "
                     f"unknown parameter, nor a fitted {YOUNG}{hint}",

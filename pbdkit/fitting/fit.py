@@ -13,7 +13,7 @@ import scipy.linalg  # noqa: F401  # loaded before threads are limited
 from pbdkit.array_types import Floats
 from pbdkit.equilibrium.error_bound import UnconvergedError
 from pbdkit.equilibrium.system import one_thread
-from pbdkit.errors import ExperimentError
+from pbdkit.errors import ExperimentError, no_such
 from pbdkit.fitting.crack_tip import locate_tip
 from pbdkit.fitting.derived import derive, refuse_other_names
 from pbdkit.fitting.fit_file import AnyBounds, Fit
@@ -101,17 +101,7 @@ def fit_experiment(
                 return _fit_specimens(fit, experiment, classes)
             return _fit(fit, experiment, classes)
     except ExperimentError as error:
-        raise _with_place(error, experiment) from None
-
-
-def _with_place(error: ExperimentError, experiment: Experiment) -> ExperimentError:
-    """Add the place in the fit file, or in its experiment, to an error."""
-    if error.located or not error.where:
-        return error
-    if error.where[0] not in Fit.model_fields:
-        return experiment.located(error)
-    place = ".".join(map(str, error.where))
-    return ExperimentError(f"{place}: {error}", error.where)
+        raise fit.located(error, experiment) from None
 
 
 def _fit_specimens(
@@ -234,7 +224,7 @@ def problem_of(
     if force and isinstance(observations[0], FieldObservation):
         groups = observations[0].scene.leading
         if force.group >= len(groups):
-            text = f"there is no leader group {force.group}"
+            text = no_such("leader group", force.group, len(groups))
             raise ExperimentError(text, ("force", "group"))
     problem = Problem(unknowns, tuple(observations))
     _refuse_changing_units(problem, fit)
@@ -289,8 +279,6 @@ def _unknown(path: str, bounds: AnyBounds, experiment: Experiment) -> Unknown:
     try:
         return Unknown.of(path, bounds, experiment)
     except ExperimentError as error:
-        if not isinstance(bounds[0], str):
-            raise
         raise ExperimentError(str(error), ("unknown", path)) from None
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, TypeVar
@@ -29,7 +30,7 @@ from pydantic import (
 
 from pbdkit.array_types import Floats
 from pbdkit.components.gauges import Extensometer, Gauge, StrainGauge
-from pbdkit.errors import ExperimentError, did_you_mean
+from pbdkit.errors import ExperimentError, PbdkitError, did_you_mean, no_such
 from pbdkit.fitting.channels import (
     Channel,
     ControlledOpening,
@@ -70,7 +71,7 @@ from pbdkit.model.solver import Equilibrium, Toward
 from pbdkit.model.validation import closed_part, fault, read_columns, report
 from pbdkit.plugin.component import Component, Strict
 from pbdkit.plugin.schedule import AS_LIST, AS_PART, AS_WORD, PLAIN, WITH_UNITS, WORD
-from pbdkit.plugin.units import LENGTH, number_with_unit
+from pbdkit.plugin.units import LENGTH, Scales, Units, number_with_unit
 from pbdkit.scene.scene import Scene, build_scene
 
 if TYPE_CHECKING:
@@ -426,7 +427,8 @@ class MeasuredCurve(MeasuredColumns):
     def _channels(self, scene: Scene) -> tuple[Channel, Channel]:
         """Return the measured channel, and the channel of the abscissae."""
         if self.group is not None and self.group >= len(scene.leading):
-            raise ExperimentError(f"there is no leader group {self.group}", ("measured", "group"))
+            text = no_such("leader group", self.group, len(scene.leading))
+            raise ExperimentError(text, ("measured", "group"))
         force, displacement = self._of_group_or_load(scene)
         value = GaugeReading(self.quantity) if isinstance(self.quantity, Gauge) else force
         over: Channel | None
@@ -499,16 +501,22 @@ FOLDER = Path(__file__).parent.parent / "fits"
 
 
 def _two(bounds: Pair) -> Pair:
-    if not bounds[0] < bounds[1]:
-        raise ValueError(f"expected [lower bound, upper bound], got {list(bounds)}")
+    _refuse_wrong_order(bounds, bounds)
     return bounds
+
+
+def _refuse_wrong_order(numbers: Pair, bounds: Pair | tuple[str, str]) -> None:
+    if not numbers[0] < numbers[1]:
+        low, high = bounds
+        text = f"write [{high}, {low}]" if numbers[1] < numbers[0] else "give two different ones"
+        raise ValueError(f"expected [lower bound, upper bound], got [{low}, {high}]; {text}")
 
 
 def _in_one_unit(bounds: tuple[str, str]) -> tuple[str, str]:
     (low, unit), (high, other) = map(number_with_unit, bounds)
     if unit != other:
         raise ValueError(f"expected bounds in the same unit, got {unit} and {other}")
-    _two((low, high))
+    _refuse_wrong_order((low, high), bounds)
     return bounds
 
 
@@ -564,7 +572,23 @@ class Sampler(Strict):
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
 
 
-class Fit(Strict):
+class FitFile(Strict):
+    """A fit, with the places of its values in its file."""
+
+    _source: Source = Source()
+
+    def located(self, error: ExperimentError, experiment: Experiment) -> ExperimentError:
+        """Return an error with the place in the fit file, or in its experiment, in the message."""
+        if error.located or not error.where:
+            return error
+        if error.where[0] not in type(self).model_fields:
+            return experiment.located(error)
+        result = ExperimentError(self._source.message(error.where, str(error)), error.where)
+        result.located = True
+        return result
+
+
+class Fit(FitFile):
     """Fits the `unknown` parameters of an experiment, within bounds, to one or several
     measurements, which are fields in equilibrium, tracks or curves.
 
@@ -663,7 +687,11 @@ class Fit(Strict):
                 f"measurement {names.index(None)} names no `specimen`; name it in all or in none"
             )
         if len(self.by_specimen()) < 2:
-            raise ValueError("`specimens: true` requires measurements of at least two specimens")
+            raise fault(
+                "requires measurements of at least two specimens"
+                "; add measurements of another one, or omit `specimens`",
+                key="specimens",
+            )
         if self.profile or self.sampler or self.candidates:
             raise ValueError(
                 "`profile`, `sampler` and `candidates` describe one specimen; omit them, or fit "
@@ -813,7 +841,7 @@ def _peaks_of_curves(rows: Floats, quantity: str) -> Floats:
     return np.array(peaks)
 
 
-class StrengthFit(Strict):
+class StrengthFit(FitFile):
     """Fits the strength of bonds and its scatter to repeated tests of one experiment.
 
     They are the `unknown` parameters, with bounds.
@@ -866,6 +894,7 @@ def read_fit(
     *,
     has_experiment: bool = False,
     measured: xarray.Dataset | None = None,
+    units: Units | None = None,
 ) -> tuple[AnyFit, Source]:
     """Read a fit from a file, a shipped name or a mapping.
 
@@ -879,6 +908,8 @@ def read_fit(
         Whether the caller provides the experiment, so that the fit need not name one.
     measured
         Dataset that replaces the file of the measurement.
+    units
+        Units of the experiment that the caller provides.
 
     Returns
     -------
@@ -899,14 +930,25 @@ def read_fit(
         source = of_kind(FIT, read_file(path))
     if has_experiment and isinstance(source.data, dict):
         source = Source(source.name, {"experiment": "", **source.data}, source.places, source.files)
-    context: dict[str, Any] = {"files": source.files}
+    context: dict[str, Any] = {"files": source.files, "units": units or _units(path, source)}
     if measured is not None:
         source, context[DATASET] = _with_dataset(source), measured
     try:
         fit = model.model_validate(source.data, context=context)
     except ValidationError as error:
         raise report(error, source) from None
+    object.__setattr__(fit, "_source", source)
     return fit, source if has_experiment else base_source(path, fit.experiment, source)
+
+
+def _units(path: Path, source: Source) -> Units | None:
+    """Return the units of the experiment of a fit; None if it has none, or if they are invalid,
+    which is reported when the experiment is built."""
+    base = source.data.get("experiment") if isinstance(source.data, Mapping) else None
+    with suppress(PbdkitError, ValidationError):
+        data = base_source(path, base, source).data
+        return Scales.model_validate({"units": data.get("units")}).units
+    return None
 
 
 def _with_dataset(source: Source) -> Source:

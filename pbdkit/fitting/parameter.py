@@ -128,7 +128,12 @@ class Parameter:
         ExperimentError
             If the text is not a valid value of the parameter.
         """
-        return self.value_in(self._rebuilt(experiment, text, f"{self.path} = {text}"))
+        label = f"{self.path} = {text}"
+        try:
+            return self.value_in(self._rebuilt(experiment, text, label))
+        except ExperimentError as error:
+            fault = str(error).removeprefix(f"{label}: ").removeprefix(f"{self.path}: ")
+            raise ExperimentError(fault, error.where) from None
 
     def _rebuilt(self, experiment: Experiment, value: float | str, label: str) -> Experiment:
         """Return the experiment, built from its source with another value."""

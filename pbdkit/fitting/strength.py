@@ -40,7 +40,7 @@ from pbdkit.array_types import Floats, Mask
 from pbdkit.components.diagnostics import reactions
 from pbdkit.equilibrium.load_stepping import finder_of, increments, moments
 from pbdkit.equilibrium.system import one_thread
-from pbdkit.errors import ExperimentError
+from pbdkit.errors import ExperimentError, no_such
 from pbdkit.fitting.fit_file import Peaks, StrengthFit
 from pbdkit.fitting.parameter import Parameter
 from pbdkit.fitting.problem import IDENTIFIABLE_RATIO
@@ -211,7 +211,8 @@ class LoadedGroup:
         size = np.hypot.reduce(displacements, axis=1)
         group = int(size.argmax()) if peaks.group is None else peaks.group
         if group >= len(displacements):
-            raise ExperimentError(f"there is no leader group {group}", ("measured", "group"))
+            text = no_such("leader group", group, len(displacements))
+            raise ExperimentError(text, ("measured", "group"))
         if size[group] == 0.0:
             raise ExperimentError(
                 f"leader group {group} does not move; use one that loads the body",
@@ -1108,13 +1109,16 @@ def fit_strength_of(fit: StrengthFit, experiment: Experiment) -> FittedStrength:
     ExperimentError
         If the strengths cannot be fitted.
     """
-    with one_thread():
-        if fit.method == "simulation":
-            return _fit_with_simulations(fit, experiment, None)
-        result = _fit_by_likelihood(fit, experiment)
-        if fit.method == "auto" and result.checked and not result.checked.holds:
-            return _fit_with_simulations(fit, experiment, result.checked)
-        return result
+    try:
+        with one_thread():
+            if fit.method == "simulation":
+                return _fit_with_simulations(fit, experiment, None)
+            result = _fit_by_likelihood(fit, experiment)
+            if fit.method == "auto" and result.checked and not result.checked.holds:
+                return _fit_with_simulations(fit, experiment, result.checked)
+            return result
+    except ExperimentError as error:
+        raise fit.located(error, experiment) from None
 
 
 def _fit_by_likelihood(fit: StrengthFit, experiment: Experiment) -> FittedStrength:

@@ -41,7 +41,7 @@ from pbdkit.errors import (
     warn_caller,
 )
 from pbdkit.hooks import pbdkit_version
-from pbdkit.io.layout import CONVENTIONS, SCHEMA_VERSION, Column
+from pbdkit.io.layout import CONVENTIONS, SCHEMA_VERSION, Column, diagnostics_that_provide
 from pbdkit.io.open import open as open_result
 from pbdkit.io.recorder import Recorder
 from pbdkit.io.save import write_dataset
@@ -290,8 +290,10 @@ class SizeEstimate:
         for name in self._keep.variables or ():
             if name not in columns:
                 hint = did_you_mean(name, columns)
+                if makers := diagnostics_that_provide({name}):
+                    hint = f"; add {' or '.join(makers)} to `diagnostics` of the experiment"
                 what = f"there is no variable '{name}'{hint} (known: {', '.join(columns)})"
-                raise ExperimentError(f"keep.variables: {what}", ("keep", "variables"))
+                raise ExperimentError(what, ("keep", "variables"))
         self._columns |= columns
         for dim, size in plan.sizes.items():
             self._sizes[dim] = max(size, self._sizes.get(dim, 0))
@@ -304,7 +306,7 @@ class SizeEstimate:
         """
         keep, last = self._keep, max(steps for steps, *_ in self._times)
         if isinstance(keep.times, tuple) and min(keep.times) > last:
-            text = f"keep.times: {min(keep.times)} exceeds the last step of all members, {last}"
+            text = f"{min(keep.times)} exceeds the last step of all members, {last}"
             raise ExperimentError(text, ("keep", "times"))
         sizes = self._sizes | {"time": self._number_of_times()}
         names = None if keep.variables is None else {*keep.variables}
@@ -459,8 +461,12 @@ def validated(plan: SweepPlan, show: Show) -> tuple[list[Dimension], list[Member
             versions |= member.job.versions
         outlook.refuse_too_large()
     except ExperimentError as error:
-        name = plan.source.name
-        raise ExperimentError(f"{name}: {error}" if name else str(error), error.where) from None
+        name, text = plan.source.name, str(error)
+        if error.where[:1] == ("keep",):
+            text = plan.source.message(error.where, text)
+        elif name:
+            text = f"{name}: {text}"
+        raise ExperimentError(text, error.where) from None
     return grid, members, versions
 
 

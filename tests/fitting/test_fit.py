@@ -403,7 +403,7 @@ WRONG = {
     "points elsewhere": ({"measured": {"margin": 100.0}}, "only 0 measured numbers"),
     "no such group": (
         {"force": {"group": 7, "value": [1.0, 0.0]}},
-        "^force.group: there is no leader group 7",
+        "^fit: force.group: there is no leader group 7",
     ),
     "a force that is none": ({"force": {"group": 1, "value": [0.0, 0.0]}}, "modulus; omit it"),
     "a force the other way": ({"force": {"group": 1, "value": [-1.0, 0.0]}}, "change its sign"),
@@ -520,3 +520,58 @@ def test_dataset_is_fitted_like_the_file_with_its_columns(tmp_path):
     ):
         with pytest.raises(pbdkit.ExperimentError, match=said):
             pbdkit.fit(fit, measured=wrong)
+
+
+PLACES = {
+    "another parameter": (
+        "rule.poisson_ratio",
+        "rule.poison_ratio",
+        "fit.yaml:13:11: unknown.rule.poison_ratio: .* there is no 'poison_ratio'; did you mean",
+    ),
+    "bounds in the wrong order": (
+        "[0.0, 0.49]",
+        "[0.49, 0.0]",
+        r"fit.yaml:13:11: .*: expected \[lower bound, upper bound\], .*; write \[0.0, 0.49\]",
+    ),
+    "a variable of a diagnostic": (
+        "measured:",
+        "derived: [K_I]\nmeasured:",
+        r"fit.yaml:14:11: derived.0: 'K_I' .*; add \{type: stress-intensity.*\} to `diagnostics`",
+    ),
+    "one specimen": (
+        "measured:",
+        "specimens: true\nmeasured:",
+        "fit.yaml:14:1: specimens: requires measurements of at least two specimens; .*, or omit",
+    ),
+    "no such cut": (
+        "measured:",
+        "crack_tip: {cut: 1, within: 2.5 mm}\nmeasured:",
+        "fit.yaml:14:13: crack_tip.cut: there is no cut 1; the experiment has no cuts",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", PLACES)
+def test_errors_have_a_place_in_the_fit_file(name, tmp_path):
+    old, new, message = PLACES[name]
+    text = """experiment:
+  units: {length: 2 mm}
+  lattice: {type: square, a: 1.0}
+  body: {type: rectangle, width: 8.0, height: 4.0}
+  neighbours: {type: chebyshev, shells: 1}
+  rule: {type: elastic, poisson_ratio: 0.3}
+  frame: {type: natural}
+  leaders:
+    - {select: {edge: left}, motion: {type: hold}}
+    - {select: {edge: right}, motion: {type: displace, displacement: [0.25, 0.0]}}
+  steps: 1
+  solver: {type: equilibrium}
+unknown: {rule.poisson_ratio: [0.0, 0.49]}
+measured: {file: field.csv, noise: 1.0e-3}
+"""
+    rows = [f"{x},{y},{0.03 * x},{-0.009 * (y - 2)}" for x in range(1, 8) for y in range(1, 4)]
+    (tmp_path / "field.csv").write_text("\n".join(["x,y,ux,uy", *rows]))
+    path = tmp_path / "fit.yaml"
+    path.write_text(text.replace(old, new))
+    with pytest.raises(pbdkit.ExperimentError, match=message):
+        pbdkit.fit(path)

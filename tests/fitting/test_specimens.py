@@ -189,7 +189,7 @@ WRONG = {
     "a profile": (lambda fit: {"profile": [RATIO]}, "describe one specimen"),
     "an error in one": (
         lambda fit: {"measured": [*fit["measured"][:2], fit["measured"][2] | {"margin": 100.0}]},
-        "^measured.file: specimen c: only 0 measured numbers",
+        "^fit: measured.file: specimen c: only 0 measured numbers",
     ),
     "a force at a second measurement": (
         lambda fit: {"measured": [entry | {"specimen": n // 2} for n, entry in
