@@ -835,12 +835,16 @@ def _linear_step(at: Linearisation, low: Floats, high: Floats, loss: Loss) -> Fl
     scaled, y = at.jacobian[:, is_free] / size, np.zeros(size.shape)
     for _ in range(1 if loss == "linear" else MAX_REWEIGHTINGS):
         weight = np.sqrt(_weight(at.residuals - scaled @ y, loss))
-        basis, sizes, vectors = _singular(scaled * weight[:, None])
+        basis, triangle = np.linalg.qr(scaled * weight[:, None])
         projection = basis.T @ (at.residuals * weight)
-        previous, y = y, vectors.T @ (projection / sizes)
+        left_vectors, sizes, vectors = _singular(triangle)
+        previous, y = y, vectors.T @ (left_vectors.T @ projection / sizes)
         if (y < low * size).any() or (y > high * size).any():
-            matrix = sizes[:, None] * vectors
-            y = np.asarray(_solve_bounded(matrix, projection, low * size, high * size))
+            # Steps along null directions are damped, but their residuals are not omitted.
+            null = np.eye(len(y)) - vectors.T @ vectors
+            matrix = np.vstack([triangle, RANK * sizes.max(initial=0.0) * null])
+            values = np.concatenate([projection, np.zeros(len(y))])
+            y = np.asarray(_solve_bounded(matrix, values, low * size, high * size))
         if (np.abs(y - previous) <= STEADY).all():
             break
     step = np.zeros(len(is_free))
@@ -867,7 +871,7 @@ def _solve_bounded(matrix: Floats, values: Floats, low: Floats, high: Floats) ->
 
     is_bounded, y = np.isfinite(low) | np.isfinite(high), np.zeros(len(low))
     others = matrix[:, ~is_bounded]
-    basis, *_ = _singular(others)
+    basis, _ = np.linalg.qr(others)
     columns = matrix[:, is_bounded]
     y[is_bounded] = lsq_linear(
         columns - basis @ (basis.T @ columns),
@@ -875,7 +879,7 @@ def _solve_bounded(matrix: Floats, values: Floats, low: Floats, high: Floats) ->
         (low[is_bounded], high[is_bounded]),
         method="bvls",
     ).x
-    y[~is_bounded] = np.linalg.lstsq(others, values - columns @ y[is_bounded], rcond=RANK)[0]
+    y[~is_bounded] = np.linalg.lstsq(others, values - columns @ y[is_bounded], rcond=None)[0]
     return y
 
 

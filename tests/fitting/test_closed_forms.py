@@ -101,6 +101,22 @@ def test_a_linear_step_is_the_least_squares_solution_between_bounds(units: float
         np.testing.assert_allclose(step / units, exact, atol=1e-7)
 
 
+def test_a_step_between_bounds_reduces_the_cost_with_nearly_dependent_columns() -> None:
+    """At its bound, a parameter p is replaced by the nearly dependent unknowns a and b.
+
+    The columns b - a = 3e-5 p + 1.2e-5 t. The component along t belongs to a null direction of all
+    columns, but it is not small if the residuals along p are removed by b - a.
+    """
+    p, a, t = np.linalg.qr(RNG.normal(size=(12, 3)))[0].T
+    J = np.stack([p, a, a + 3e-5 * p + 1.2e-5 * t], axis=1)
+    high = np.array([0.1, np.inf, np.inf])
+    for size in (1.0, 1e3, 1e6):
+        r = size * (p - 2.0 * t)
+        step = problem._linear_step(linearisation(r, J), -high, high, "linear")
+        assert abs(step[0]) <= 0.1
+        assert problem.cost_of(r - J @ step, "linear") < problem.cost_of(r, "linear")
+
+
 @pytest.mark.parametrize("loss", ["huber", "soft_l1", "cauchy"])
 def test_a_robust_step_minimises_the_loss(loss: Any) -> None:
     """Reweighting ends at the minimum of the cost, with outliers."""
