@@ -12,6 +12,9 @@ LIBRARIES = 2**30
 
 560 MiB were measured while a kernel was compiled. Some libraries crash or hang if there is less.
 """
+FILE_CACHE = 2**21
+"""Number of bytes that HDF5 allocates to open a file, with a margin. It reads a null pointer if
+there is less."""
 CONTAINER = Path("/sys/fs/cgroup/memory.max")
 """File with the memory limit of a container."""
 
@@ -49,6 +52,11 @@ def refuse_little_memory() -> None:
             f"{LIBRARIES / 2**20:.0f} are needed"
         )
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+
+def refuse_no_file_cache() -> None:
+    """Raise MemoryError if HDF5 could not allocate the memory to open a file."""
+    bytes(FILE_CACHE)
 
 
 def address_limit() -> int | None:

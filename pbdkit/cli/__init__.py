@@ -169,7 +169,12 @@ def _contexts(error: BaseException | None) -> Iterator[BaseException]:
 def _of_memory(error: BaseException) -> bool:
     """Return whether the error means that memory is exhausted. Threads and libraries report this in
     different ways."""
-    words = "can't start new thread", "failed to map segment", "Cannot allocate memory"
+    words = (
+        "can't start new thread",
+        "failed to map segment",
+        "Cannot allocate memory",
+        "memory allocation failed",  # of HDF5
+    )
     return isinstance(error, MemoryError) or any(word in str(error) for word in words)
 
 

@@ -7,12 +7,15 @@ from typing import Any
 
 import h5py
 
+from pbdkit.memory import refuse_no_file_cache
+
 
 class Hdf5File(h5py.File):  # type: ignore[misc]  # h5py has no annotations
     """HDF5 file that keeps the objects that have been looked up by their path."""
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         self._objects: dict[str, Any] = {}
+        refuse_no_file_cache()
         super().__init__(*arguments, **options)
 
     def __getitem__(self, name: Any) -> Any:

@@ -21,6 +21,7 @@ from pbdkit.array_types import Array
 from pbdkit.errors import ExperimentError
 from pbdkit.io.atomic_file import NewFile, open_atomic
 from pbdkit.io.layout import broken_by
+from pbdkit.memory import refuse_no_file_cache
 
 if TYPE_CHECKING:
     import h5py
@@ -157,6 +158,7 @@ def export(dataset: xarray.Dataset, path: Path, scene: Scene | None, *, replace:
     if "position" not in dataset.variables:
         raise ExperimentError("there are no positions to write; keep the variable `position`")
     grid = grid_of(dataset, scene)
+    refuse_no_file_cache()
     with open_atomic(path, NewFile, replace=replace) as new, h5py.File(new, "w") as file:
         _write(file, dataset, grid)
 

@@ -321,11 +321,12 @@ def _symbols(scene: Scene) -> Complex:
     angle, axes, sites = 2 * np.pi * np.arange(WAVES) / WAVES, scene.axes, len(stencil.centre)
     waves = [angle[: WAVES // 2 + 1], *[angle] * (axes - 1)]
     theta = np.stack(np.meshgrid(*waves, indexing="ij"), axis=-1).reshape(-1, axes)
-    symbols: Complex = np.zeros((len(theta), sites, axes, sites, axes), complex)
-    symbols += np.eye(sites * axes).reshape(symbols.shape[1:])
+    matrices = np.zeros((1 + len(stencil.neighbours), sites, axes, sites, axes), complex)
+    matrices[0] = np.eye(sites * axes).reshape(matrices.shape[1:])
     for s, centre in enumerate(stencil.centre):
-        symbols[:, s, :, s] += centre
-    for slot, matrix in stencil.neighbours.items():
-        phase = np.exp(1j * theta @ np.array(slot.cell, float))
-        symbols[:, slot.source, :, slot.target] += phase[:, None, None] * matrix
+        matrices[0, s, :, s] += centre
+    for n, (slot, matrix) in enumerate(stencil.neighbours.items(), 1):
+        matrices[n, slot.source, :, slot.target] = matrix
+    cells = np.array([[0] * axes, *(slot.cell for slot in stencil.neighbours)], float)
+    symbols: Complex = np.exp(1j * theta @ cells.T) @ matrices.reshape(len(matrices), -1)
     return symbols.reshape(len(theta), sites * axes, sites * axes)

@@ -90,6 +90,8 @@ INTERRUPTED = "interrupted"
 """Status of members that were interrupted."""
 LOST = "lost"
 """Status of members that were lost with their process."""
+AGAIN = "the same command runs this member again"
+"""Remedy for a failure that need not be repeated."""
 _one_at_a_time = threading.Lock()
 """Lock by which only one thread of a process, for example of a dask worker, runs a member.
 
@@ -224,6 +226,9 @@ def run_member(
             status, message, lasting = FAILED, str(error), True
         except PbdkitError as error:
             status, message = FAILED, str(error)
+        except MemoryError as error:
+            status = FAILED
+            message = "; ".join(["out of memory", *filter(None, [str(error)]), AGAIN])
         except (Exception, SystemExit) as error:
             status, message = FAILED, worded(error)
     seconds = time.perf_counter() - start

@@ -268,6 +268,7 @@ def test_memory_limit_is_reported_in_one_line(call: Call, mib: int, code: int) -
         "MemoryError",
         'RuntimeError("can\'t start new thread")',
         "ImportError('libx.so: failed to map segment from shared object')",
+        'OSError("Can\'t synchronously write data (memory allocation failed for chunk)")',
     ],
 )
 def test_out_of_memory_during_a_run_is_reported(error: str, capsys: Any, monkeypatch: Any) -> None:
@@ -288,6 +289,8 @@ def test_out_of_memory_during_a_run_is_reported(error: str, capsys: Any, monkeyp
     [
         ("pbdkit.linear.stencil._eigenvalues", ["run", "e.json", "-o", "new.nc"]),
         ("pbdkit.io.open.open_sealed", ["plot", "out.nc"]),
+        ("pbdkit.io.hdf5_file.refuse_no_file_cache", ["plot", "out.nc"]),
+        ("pbdkit.io.hdf5_file.refuse_no_file_cache", ["run", "e.json", "-o", "new.nc"]),
         ("pbdkit.cli.verify.open_sealed", ["verify", "out.nc"]),
     ],
 )

@@ -1,7 +1,17 @@
 import h5py
 import numpy as np
+import pytest
 
+from pbdkit import memory
 from pbdkit.io.hdf5_file import Hdf5File
+
+
+def test_no_file_is_opened_without_memory_for_its_cache(tmp_path, monkeypatch):
+    """The library would read a null pointer."""
+    monkeypatch.setattr(memory, "FILE_CACHE", 2**60)
+    with pytest.raises(MemoryError):
+        Hdf5File(tmp_path / "a.h5", "w")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_objects_are_looked_up_once_and_anew_after_a_deletion(tmp_path, monkeypatch):

@@ -120,6 +120,8 @@ class Command:
     same: Callable[[Path, Path], list[str]] = field(
         default=lambda one, other: _same_bytes(one, other)
     )
+    partial: int | None = None
+    """Exit status of a result in which a part is missing that the next command adds."""
     again: Callable[[], list[str]] | None = None
     """The command by which one comes to the result after a fault; by default the same one."""
 
@@ -152,13 +154,21 @@ def _same_sweep(one: Path, other: Path) -> list[str]:
         return []
     try:
         for path in (one, other):
-            with SealedFile(path) as file:
-                file.check()
-                if file.seal is None:
-                    return [f"{path}: has no seal"]
+            if findings := _unsealed(path):
+                return findings
         with pbdkit.open(one) as first, pbdkit.open(other) as second:
             first.attrs["created"] = second.attrs["created"]
             return [] if first.identical(second) else [f"{one}: other values"]
+    except Exception as error:  # as above
+        return [f"{type(error).__name__}: {error}"]
+
+
+def _unsealed(path: Path) -> list[str]:
+    """Return a finding if a file differs from its checksums, or has none."""
+    try:
+        with SealedFile(path) as file:
+            file.check()
+            return [] if file.seal else [f"{path}: has no seal"]
     except Exception as error:  # as above
         return [f"{type(error).__name__}: {error}"]
 
@@ -307,7 +317,7 @@ def commands() -> dict[str, Command]:
             ["resume", "out.nc"], "out.nc", _unfinished, _each_step, _same_run, _resume
         ),
         "longer": Command(LONGER, "out.nc", _finished, _each_step, _same_run, _lengthened),
-        "sweep": Command(SWEEPING, "s/sweep.nc", _sweeping, same=_same_sweep),
+        "sweep": Command(SWEEPING, "s/sweep.nc", _sweeping, same=_same_sweep, partial=5),
         "store in a journal": Command(
             RUN, "out.nc", _experiment, _on_network(_each_step), _same_run, _resume
         ),
@@ -320,7 +330,7 @@ def commands() -> dict[str, Command]:
             _resume,
         ),
         "sweep in a journal": Command(
-            SWEEPING, "s/sweep.nc", _sweeping, _on_network(), same=_same_sweep
+            SWEEPING, "s/sweep.nc", _sweeping, _on_network(), same=_same_sweep, partial=5
         ),
         "fit": Command(FITTING, "out.json", _fitting),
         "fit --plot": Command([*FITTING, *PLOTTED], "out.png", _fitting),
@@ -471,7 +481,8 @@ class Bench:
     def _answered(self, kind: str, code: int, said: str) -> Iterator[str]:
         """Check the exit status and the message."""
         lines = [line for line in said.splitlines() if line.startswith("pbdkit")]
-        if code not in ((0,) if kind == "short" else (0, 6)):
+        partial = (self.command.partial,) if kind in MEMORY_KINDS else ()
+        if code not in ((0,) if kind == "short" else (0, 6, *partial)):
             yield f"exit {code}: {said[-300:]}"
         if "a bug in pbdkit" in said or "Traceback" in said:
             yield f"message {said[-300:]}"
@@ -496,7 +507,9 @@ class Bench:
             left = [p for p in self._left() if not (LOGS if code == 0 else STORES).fullmatch(p)]
             if left and not all(f"{p}: cannot be removed" in said for p in left):
                 yield f"exit {code}, left behind: {left}"
-        if output.exists() and not (
+        if code and code == self.command.partial:
+            yield from _unsealed(output)
+        elif output.exists() and not (
             (killed or code) and earlier.exists() and not _same_bytes(output, earlier)
         ):
             yield from (f"exit {code}, and {text}" for text in self.command.same(output, whole))

@@ -206,6 +206,21 @@ def test_exception_in_a_member_is_attributed_to_it(small, probing):
     assert "no luck" in str(found.message.values[1])
 
 
+def test_member_without_memory_runs_again(small, tmp_path, monkeypatch):
+    vary = {"solver.relaxation": [0.5, 1.0]}
+
+    def exhausted(*_):
+        raise MemoryError
+
+    with monkeypatch.context() as patch:
+        patch.setattr("pbdkit.sweeps.worker._ran", exhausted)
+        first = pbdkit.sweep(small, vary=vary, folder=tmp_path / "s", workers=1, progress=False)
+    assert set(first.status.values) == {"failed"}
+    assert set(first.message.values) == {"out of memory; the same command runs this member again"}
+    again = pbdkit.sweep(small, vary=vary, folder=tmp_path / "s", workers=1, progress=False)
+    assert set(again.status.values) == {"complete"}
+
+
 def test_member_that_kills_its_worker_is_lost_and_others_run(small, probing):
     probing("os.kill(os.getpid(), signal.SIGKILL)")
     small["diagnostics"] = [{"type": "probe"}]
