@@ -30,6 +30,10 @@ settings.register_profile("landing", max_examples=40, derandomize=True, deadline
 settings.register_profile("long", max_examples=2000, deadline=None)
 settings.load_profile("landing" if os.environ.get("CI") else "anywhere")
 
+# A collection of garbage after 700 new objects, the default, takes up to an eighth of the processor
+# time where many objects are created and kept, as by the collection of tests and by compiling.
+gc.set_threshold(10_000)
+
 # A shell that runs tests in the background has Ctrl-C ignored; processes started here receive it.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
