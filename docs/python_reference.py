@@ -204,11 +204,17 @@ def comments_of(module: str) -> dict[tuple[str, str], list[str]]:
 def comment_of(name: str, value: Any) -> str:
     """Return the docstring of a constant."""
     for module in sorted(m for m in sys.modules if m.startswith("pbdkit.")):
-        # Parsing takes time, so that only modules with the constant are parsed.
-        is_there = vars(sys.modules[module]).get(name) is value
+        # Parsing takes time, so that only modules that assign the constant are parsed.
+        is_there = vars(sys.modules[module]).get(name) is value and assigns(module, name)
         if is_there and (comment := comments_of(module).get(("", name))):
             return "\n".join(comment)
     raise LookupError(f"{name} has no docstring")
+
+
+def assigns(module: str, name: str) -> bool:
+    """Return whether a line of a module begins with an assignment to a name."""
+    source = inspect.getsource(sys.modules[module])
+    return re.search(rf"^{name}\b[^=\n]*=", source, re.M) is not None
 
 
 def is_model(value: Any) -> bool:
