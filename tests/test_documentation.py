@@ -79,6 +79,7 @@ FEWER = {
     "run fracture/notched-beam": ["--set", "steps=4"],
     "run paper/f2": ["--set", "steps=60"],
     "run material/dogbone": ["--set", "steps=240", "--set", "fracture.failure=0.002"],
+    "run fracture/edge-crack": ["--set", "steps=1"],
 }
 """Options of commands that take long: movies of fewer steps, which draw all of them alike; sweeps
 in this process; runs of the first steps; and specimens that break early or are coarse."""
