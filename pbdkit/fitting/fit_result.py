@@ -21,7 +21,15 @@ from pbdkit.fitting.observations import (
     Observation,
     TracksObservation,
 )
-from pbdkit.fitting.problem import MODULUS, Loss, Problem, Solution, spread_of
+from pbdkit.fitting.problem import (
+    MODULUS,
+    Loss,
+    Problem,
+    Solution,
+    reason_of,
+    spread_of,
+    steps_beyond_bounds,
+)
 from pbdkit.fitting.residual_pattern import remedy_of_excess
 from pbdkit.fitting.uncertainty import (
     Candidate,
@@ -41,6 +49,8 @@ from pbdkit.simulation import Simulation, record
 if TYPE_CHECKING:
     import xarray
 
+BEYOND_BOUND = 2.0
+"""Distance of the minimum beyond a bound, in standard errors, above which a warning is issued."""
 EXCESS_RATIO = 1.5
 """Ratio of residuals to noise above which a warning is issued."""
 EXCESS_DEVIATIONS = 4.0
@@ -219,6 +229,9 @@ class Fitted:
         Quantities derived from the fit, by formula.
     crack_tip : LocatedTip or None
         Position of the crack tip, if it is unknown.
+    beyond_bounds : mapping of str to float
+        Distance of the minimum without bounds beyond each bound that the fit has reached, in
+        standard errors, by path.
     """
 
     values: Mapping[str, Estimate]
@@ -234,6 +247,7 @@ class Fitted:
     candidates: tuple[Candidate, ...] = ()
     derived: Mapping[str, Derived] = field(default_factory=dict)
     crack_tip: LocatedTip | None = None
+    beyond_bounds: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def noise(self) -> float:
@@ -287,9 +301,17 @@ class Fitted:
 
     @property
     def warnings(self) -> tuple[WarningText, ...]:
-        """Warnings of residuals well above the noise, and of an end at kinks of the prediction."""
+        """Warnings of bounds that exclude the minimum, of residuals well above the noise, and of an
+        end at kinks of the prediction."""
         several = len(self.misfits) > 1
         texts = [
+            f"unknown.{path}: the fit stops at the bound {self._value_of(path):.6g}, and would be "
+            f"better beyond it: the minimum is {distance:.1f} standard errors away; widen this "
+            "bound, or correct the model if the values beyond it are impossible"
+            for path, distance in self.beyond_bounds.items()
+            if distance > BEYOND_BOUND
+        ]
+        texts += [
             _excess_text(misfit, n, several)
             for n, misfit in enumerate(self.misfits)
             if misfit.exceeds_noise
@@ -302,6 +324,18 @@ class Fitted:
             )
         return tuple(WarningText(text, AccuracyWarning) for text in texts)
 
+    def _value_of(self, path: str) -> float:
+        return float(self.solution.z[[*self.values].index(path)])
+
+    @cached_property
+    def reasons(self) -> dict[str, str]:
+        """Why the data do not determine each parameter that is not identifiable, and remedies."""
+        return {
+            path: reason_of(self.problem, self.solution, path)
+            for path, estimate in self.values.items()
+            if not estimate.identifiable
+        }
+
     def as_dict(self) -> dict[str, Any]:
         """Return the result as plain values, for JSON.
 
@@ -311,6 +345,8 @@ class Fitted:
             Content of the file that `pbdkit fit` writes.
         """
         named = {path: estimate.as_dict() for path, estimate in self.values.items()}
+        for path, reason in self.reasons.items():
+            named[path]["reason"] = reason
         modulus = self.youngs_modulus
         return {
             "values": named,
@@ -496,6 +532,8 @@ class Fitted:
     def _lines(self) -> Iterator[str]:
         for path, estimate in self.values.items():
             yield f"{path}: {estimate}"
+            if reason := self.reasons.get(path):
+                yield f"  {reason}"
         if self.youngs_modulus:
             yield f"{MODULUS}: {self.youngs_modulus}"
         if self.crack_tip:
@@ -563,7 +601,15 @@ def fitted(fit: Fit, problem: Problem, solution: Solution) -> Fitted:
     modulus = youngs_modulus(fit.measured_force, problem, solution)
     several = combinations(problem, solution)
     return Fitted(
-        values, correlations, modulus, misfits, ratio, problem, solution, combinations=several
+        values,
+        correlations,
+        modulus,
+        misfits,
+        ratio,
+        problem,
+        solution,
+        combinations=several,
+        beyond_bounds=steps_beyond_bounds(problem, solution, fit.loss),
     )
 
 

@@ -1082,6 +1082,50 @@ def _influence(residuals: Floats, unknowns: float, loss: Loss) -> tuple[Floats, 
     return z / (1.0 + z * z), (1.0 - z * z) / (1.0 + z * z) ** 2
 
 
+def steps_beyond_bounds(problem: Problem, solution: Solution, loss: Loss) -> dict[str, float]:
+    """Return the distance of the minimum of the linearised problem beyond each bound that the fit
+    has reached, in standard errors, by path."""
+    if not solution.on_bounds:
+        return {}
+    at, free, steps = solution.at, np.full(problem.size, np.inf), dict[str, float]()
+    step = _linear_step(at, -free, free, loss) / solution.errors
+    for unknown, value, distance in zip(problem.unknowns, at.z, step, strict=False):
+        if unknown.parameter.path in solution.on_bounds:
+            outward = -1.0 if value - unknown.low < unknown.high - value else 1.0
+            steps[unknown.parameter.path] = max(0.0, float(outward * distance))
+    return steps
+
+
+def reason_of(problem: Problem, solution: Solution, path: str) -> str:
+    """Return why the data do not determine a parameter, and a remedy."""
+    paths = [unknown.parameter.path for unknown in problem.unknowns]
+    n, directions = paths.index(path), solution.directions
+    effect = np.linalg.norm(solution.at.jacobian[:, n]) * problem.unknowns[n].span
+    if effect <= FROZEN:
+        return (
+            "no measured value depends on it; remove it from `unknown`, or measure a quantity that "
+            "depends on it, such as a curve of forces"
+        )
+    involved = (directions.vectors[directions.is_null] != 0.0) & (
+        directions.vectors[directions.is_null][:, [n]] != 0.0
+    )
+    if involved.any():
+        others = [name for m, name in enumerate(paths) if m != n and involved[:, m].any()]
+        if problem.with_modulus and involved[:, len(paths)].any():
+            others.append(MODULUS)
+        names = ", ".join(others) or "`modes` of boundaries and terms of `distortion`"
+        return (
+            f"changes of {names} have the same effect on all measured values; fix some of them, or "
+            "measure a quantity that distinguishes them"
+        )
+    unknown, error = problem.unknowns[n], solution.errors[n]
+    return (
+        f"its standard error, {error:.2g}, exceeds a quarter of the interval between its bounds, "
+        f"{unknown.low:.6g} to {unknown.high:.6g}; measure more values or with less noise, fit "
+        "fewer unknowns, or widen the bounds if they are narrow"
+    )
+
+
 def _on_bounds(problem: Problem, z: Floats) -> tuple[str, ...]:
     paths = []
     for unknown, value in zip(problem.unknowns, z, strict=False):

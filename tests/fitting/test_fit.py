@@ -179,17 +179,20 @@ UNTOLD = {
     "stiffness without a force": (
         {"type": "elastic", "poisson_ratio": 0.3, "stiffness": 1.0},
         {"rule.poisson_ratio": [0.0, 0.49], "rule.stiffness": [0.5, 2.0]},
-        {"rule.stiffness"},
+        {"rule.stiffness": "no measured value depends on it; remove it from `unknown`"},
     ),
     "both halves": (
         {"type": "elastic", "poisson_ratio": 0.3, "stiffness": {"otherwise": 1.0, "half": 2.0}},
         {"rule.stiffness.half": [0.5, 4.0], "rule.stiffness.otherwise": [0.5, 4.0]},
-        {"rule.stiffness.half", "rule.stiffness.otherwise"},
+        {
+            "rule.stiffness.half": "changes of rule.stiffness.otherwise have the same effect",
+            "rule.stiffness.otherwise": "changes of rule.stiffness.half have the same effect",
+        },
     ),
     "a length below the spacing": (
         {"type": "strain-gradient", "poisson_ratio": 0.3, "length": 0.05},
         {"rule.length": [0.01, 0.1]},
-        {"rule.length"},
+        {"rule.length": "exceeds a quarter of the interval between its bounds, 0.01 to 0.1"},
     ),
 }
 
@@ -208,10 +211,16 @@ def test_unidentifiable_parameters_are_reported(name, tmp_path):
             "measured": {"file": str(tmp_path / "field.csv"), "noise": NOISE},
         }
     )
-    assert {path for path, estimate in found.values.items() if not estimate.identifiable} == untold
-    for path in untold:
-        assert found.as_dict()["values"][path]["value"] is None
-        assert f"{path}: not identifiable from the data" in str(found).splitlines()
+    assert {path for path, estimate in found.values.items() if not estimate.identifiable} == {
+        *untold
+    }
+    lines = str(found).splitlines()
+    for path, reason in untold.items():
+        content = found.as_dict()["values"][path]
+        assert content["value"] is None
+        assert reason in content["reason"] == found.reasons[path]
+        place = lines.index(f"{path}: not identifiable from the data")
+        assert lines[place + 1] == f"  {content['reason']}"
 
 
 def in_series(**more):
@@ -317,6 +326,32 @@ def test_bounds_of_an_unidentified_parameter_do_not_hide_youngs_modulus(bounds, 
     assert estimate.on_bound == (bounds[0] > 0.0)
     assert young.identifiable
     assert young.error == pytest.approx(0.01 * young.value, rel=0.1)
+
+
+@pytest.mark.parametrize("bounds", [[0.0, 0.1], [0.4, 0.49], [0.0, 0.49]])
+def test_bounds_that_exclude_the_minimum_are_named(bounds, tmp_path):
+    """The distance of the minimum, 0.3, beyond the bound is the one that wide bounds give."""
+    made, path = plate(lattice={"type": "square", "a": 2.0}), tmp_path / "field.csv"
+    measured(made, path, noise=NOISE)
+    found = fitted_between(made, path, bounds)
+    texts = [text for text in found.warnings if text.startswith("unknown.rule.poisson_ratio: ")]
+    if bounds == [0.0, 0.49]:
+        assert not texts
+        assert not found.beyond_bounds
+        return
+    bound = min(bounds, key=lambda value: abs(value - 0.3))
+    (text,) = texts
+    assert f"stops at the bound {bound}" in text
+    assert "widen this bound" in text
+    wide = fitted_between(made, path, [0.0, 0.49]).values["rule.poisson_ratio"]
+    distance = abs(wide.value - bound) / found.solution.errors[0]
+    assert found.beyond_bounds["rule.poisson_ratio"] == pytest.approx(distance, rel=0.3)
+
+
+def fitted_between(made, path, bounds):
+    given = {"file": str(path), "noise": NOISE}
+    fit = {"experiment": made, "unknown": {"rule.poisson_ratio": bounds}, "measured": given}
+    return pbdkit.fit(fit | {"modes": 3})
 
 
 @pytest.mark.parametrize(("stated", "warned"), [(NOISE, False), (NOISE / 4.0, True)])
