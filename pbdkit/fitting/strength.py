@@ -388,11 +388,8 @@ class Specimens:
             if growth > 1.0 and last.displacement > 0.0:
                 share = min(growth, reading.displacement / last.displacement)
                 peak = max(peak, MachineReading(share * last.force, share * last.displacement))
-            peak = (
-                max(peak, reading)
-                if reading.displacement > (first or reading).displacement
-                else peak
-            )
+            if first is None or reading.displacement > first.displacement:
+                peak = max(peak, reading)
             if (
                 reading.force < FAILURE_FRACTION * peak.force
                 and reading.displacement >= peak.displacement

@@ -381,3 +381,11 @@ def test_another_modulus_than_that_of_units_is_refused(softening):
     measured = softening | {"youngs_modulus": 31000.0}
     with pytest.raises(pbdkit.ExperimentError, match="31000 differs from 30000"):
         pbdkit.fit({"experiment": strip(), "unknown": unknown, "measured": measured})
+
+
+def test_profiles_of_stresses_with_an_unknown_modulus_are_refused(softening):
+    unknown = {"fracture.strength": BOUNDS["fracture.strength"]}
+    measured = {key: value for key, value in softening.items() if key != "youngs_modulus"}
+    fit = {"experiment": strip(), "unknown": unknown, "measured": measured}
+    with pytest.raises(pbdkit.ExperimentError, match="requires a known modulus if bounds are"):
+        pbdkit.fit(fit | {"profile": ["fracture.strength"]})

@@ -443,6 +443,7 @@ WRONG = {
     "a force that is none": ({"force": {"group": 1, "value": [0.0, 0.0]}}, "modulus; omit it"),
     "a force the other way": ({"force": {"group": 1, "value": [-1.0, 0.0]}}, "change its sign"),
     "bounds too wide": ({"unknown": {"rule.poisson_ratio": [0.2, 0.9]}}, "a bound is not valid"),
+    "fewer modes than none": ({"modes": -1}, "modes: should be greater"),
     "a term twice": ({"measured": {"distortion": {"ux": [[1, 0], [1, 0]]}}}, "twice"),
 }
 

@@ -390,9 +390,17 @@ def test_parameter_on_its_bound_has_no_derivative():
         RestingScene.of(experiment).change(Parameter("rule.poisson_ratio"))
 
 
-def test_parameter_that_changes_the_particles_has_no_derivative():
-    experiment = pbdkit.Experiment(
-        **SHEET | {"rule": ELASTIC, "body": {"type": "rectangle", "width": 5.1, "height": 4.1}}
-    )
+RECTANGLE = {"type": "rectangle", "width": 5.1, "height": 4.1}
+HOLE = {"type": "disc", "centre": [2.0, 2.0], "radius": 1.0005}
+BODIES = {
+    "body.width": RECTANGLE,
+    "body.of.1.radius": {"type": "difference", "of": [RECTANGLE, HOLE]},
+}
+"""Bodies with particles on the outline that a parameter moves."""
+
+
+@pytest.mark.parametrize("path", BODIES)
+def test_parameter_that_changes_the_particles_has_no_derivative(path):
+    experiment = pbdkit.Experiment(**SHEET | {"rule": ELASTIC, "body": BODIES[path]})
     with pytest.raises(pbdkit.ExperimentError, match="changes the set of particles"):
-        RestingScene.of(experiment).change(Parameter("body.width"))
+        RestingScene.of(experiment).change(Parameter(path))

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 from scipy.optimize import minimize
-from scipy.stats import t
+from scipy.stats import chi2, t
 
 import pbdkit
 from pbdkit.fitting.specimens import random_effects
@@ -19,19 +19,19 @@ TRUE = {"a": (0.25, 70.0), "b": (0.30, 60.0), "c": (0.33, 80.0)}
 NOISE = 1e-5
 
 
-def test_exact_measurements_give_the_mean_and_the_standard_deviation():
-    values = np.array([3.1, 2.7, 3.6, 2.9, 3.3])
-    mean = random_effects(values, np.full(5, 1e-6))
-    error = values.std(ddof=1) / np.sqrt(5)
+@pytest.mark.parametrize("count", [2, 5])
+def test_exact_measurements_give_the_mean_and_the_standard_deviation(count):
+    values = np.array([3.1, 2.7, 3.6, 2.9, 3.3])[:count]
+    mean = random_effects(values, np.full(count, 1e-6))
+    error = values.std(ddof=1) / np.sqrt(count)
     assert (mean.value, mean.error) == pytest.approx((values.mean(), error), rel=1e-4)
     assert mean.deviation == pytest.approx(values.std(ddof=1), rel=1e-4)
-    half = t.ppf(0.975, 4) * error
+    half = t.ppf(0.975, count - 1) * error
     assert mean.interval == pytest.approx((values.mean() - half, values.mean() + half), rel=1e-4)
     # The interval of a standard deviation of normal values, by the quantiles of χ².
-    square = 4 * values.var(ddof=1)
-    assert mean.deviation_interval == pytest.approx(
-        (np.sqrt(square / 11.1433), np.sqrt(square / 0.484419)), rel=1e-4
-    )
+    square = (count - 1) * values.var(ddof=1)
+    low, high = np.sqrt(square / chi2.ppf([0.975, 0.025], count - 1))
+    assert mean.deviation_interval == pytest.approx((low, high), rel=1e-4)
 
 
 def test_deviation_maximises_the_restricted_likelihood():

@@ -228,6 +228,19 @@ def test_broken_specimen_carries_the_load_of_the_run():
         assert found.failed
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_peak_is_known_to_an_increment_without_strains_of_bonds(seed):
+    """The strains of bonds before the first break give the peak between increments."""
+    experiment = pbdkit.Experiment(**sheet(STRAIN))
+    elastic = ElasticResponse.of(pbdkit.Experiment(**sheet(WHOLE)), ANY)
+    peaks = []
+    for known in (elastic, None):
+        specimens = Specimens.of(experiment, ANY, known)
+        peaks.append(specimens.tear(seeded(experiment, seed)).peak)
+    exact, found = peaks
+    assert exact.force - elastic.full.force / 20 < found.force <= exact.force * (1 + 1e-6)
+
+
 def test_broken_and_unbreakable_bonds_are_excluded():
     cracked = sheet(WHOLE | {"cracks": [[[1.5, -1.0], [1.5, 0.5]]]})
     scene = build_scene(pbdkit.Experiment(**cracked))

@@ -11,7 +11,7 @@ import pytest
 
 from pbdkit.identification.elastic_constants import Elasticity, elasticity
 from pbdkit.identification.identity import _character, _range_text
-from pbdkit.identification.waves import DirectionalRange, _shortest, fourth_order
+from pbdkit.identification.waves import DirectionalRange, _shortest, fourth_order, gradients
 
 VOIGT = np.array([[0, 2], [2, 1]])
 """Row of Voigt's notation of a pair of axes."""
@@ -79,6 +79,23 @@ def test_the_shortest_translations_are_found_in_any_description(basis: Any, seed
     lengths = np.sort(np.linalg.norm(exact, axis=1))
     np.testing.assert_allclose(np.linalg.norm(found, axis=1), lengths, atol=1e-9)
     assert abs(np.linalg.det(found)) == pytest.approx(abs(np.linalg.det(exact)))
+
+
+@pytest.mark.parametrize("turn", [0.0, 37.0, 120.0, 200.0, 299.7])
+def test_gradients_are_normal_to_the_densest_rows_in_any_orientation(turn: float) -> None:
+    """The rows of the triangular lattice; the lengths of isotropic waves have no direction."""
+    angles = np.radians([turn, turn + 60.0])
+    basis = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    terms = (None, None, np.eye(2), np.zeros((2, 2)), -0.1 * np.eye(2))
+    waves: Any = SimpleNamespace(stencil=SimpleNamespace(basis=basis), series=lambda _: terms)
+    found = gradients(waves)
+    np.testing.assert_allclose(
+        [gradient.direction for gradient in found],
+        np.sort((turn + np.array([30.0, 90.0, 150.0])) % 180.0),
+    )
+    for gradient in found:
+        assert gradient.rows_apart == pytest.approx(math.sqrt(0.75))
+        np.testing.assert_allclose(gradient.total, -0.1)
 
 
 def test_a_range_names_its_directions_unless_it_is_isotropic() -> None:

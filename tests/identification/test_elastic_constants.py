@@ -125,6 +125,13 @@ def test_distance_weighting_has_the_poisson_ratio_of_springs_without_rest_length
     ) in found.notes
 
 
+@pytest.mark.parametrize("nu", POISSON_RATIOS)
+def test_linear_elasticity_does_not_commute_with_finite_rotations(nu):
+    """Strains of linear elasticity are not objective, unless the rule is diffusion: ν = -1."""
+    found = identity(SQUARE, EIGHT, elastic(nu))
+    assert (found.linear, found.turns) == (True, False)
+
+
 @pytest.mark.parametrize("lattice", [SQUARE, RECTANGULAR], ids=["square", "rectangular"])
 @pytest.mark.parametrize("nu", POISSON_RATIOS)
 def test_elastic_on_rectangles_has_the_specified_material(lattice, nu):

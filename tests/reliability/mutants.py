@@ -194,7 +194,8 @@ class KernelText(Operator):  # type: ignore[misc]
 
 
 class Mutant(NamedTuple):
-    """A change of one source file; `lines` are those of the statement that contains it."""
+    """A change of one source file; `lines` are those of the statement in a function that contains
+    it, and (0, 0) for statements that the import of the file executes."""
 
     area: str
     path: str
@@ -267,15 +268,21 @@ def _is_relevant(node: Any, in_kernels: bool) -> bool:
 
 
 def _statement(node: Any) -> tuple[int, int]:
-    """Return first and last line of the statement, or of the header of a compound statement."""
-    for parent, _ in _ancestors(node):
-        if parent.type == "simple_stmt":
-            return parent.start_pos[0], parent.end_pos[0]
-        if parent.type.endswith("_stmt") or parent.type in ("funcdef", "classdef"):
-            colons = (c for c in parent.children if getattr(c, "value", "") == ":")
-            last = min((c.start_pos[0] for c in colons if c.start_pos > node.start_pos), default=0)
-            return node.start_pos[0], max(last, node.end_pos[0])
-    return node.start_pos[0], node.end_pos[0]
+    """Return first and last line of the statement in a function, or of the header of a compound
+    statement; (0, 0) for headers of functions and for statements outside functions."""
+    parents = [parent for parent, _ in _ancestors(node)]
+    if any(parent.type in ("funcdef", "lambdef") for parent in parents):
+        for parent in (node, *parents):
+            if parent.type == "simple_stmt":
+                return parent.start_pos[0], parent.end_pos[0]
+            if parent.type.endswith("_stmt"):
+                colons = (c for c in parent.children if getattr(c, "value", "") == ":")
+                ends = (c.start_pos[0] for c in colons if c.start_pos > node.start_pos)
+                last = min(ends, default=node.end_pos[0])
+                return node.start_pos[0], last if parent is node else max(last, node.end_pos[0])
+            if parent.type in ("funcdef", "classdef"):
+                break
+    return 0, 0
 
 
 def mutants_of(area: str, path: Path) -> dict[tuple[int, int], list[Mutant]]:
@@ -443,15 +450,18 @@ class Coverage:
         the others. The cheapest tests are taken until the time is used up. The n-th case of a
         function counts as n times as expensive.
 
-        If no test executes the statement, as in compiled functions and in headers of functions, all
-        tests that execute any line of the file are taken.
+        If no test executes the statement, as in compiled functions, in headers of functions and
+        outside functions, all tests that execute any line of the file are taken, and those of the
+        file that mirrors it.
         """
         lines = self.lines[mutant.path]
         first, last = mutant.lines
-        names = {name for n in range(first, last + 1) for name in lines.get(n, ())}
-        names = names or {name for covering in lines.values() for name in covering}
         source = Path(mutant.path)
         mirror = "/".join(["tests", *source.parts[1:-1], f"test_{source.stem}"])
+        names = {name for n in range(first, last + 1) for name in lines.get(n, ())}
+        if not names:
+            names = {name for covering in lines.values() for name in covering}
+            names |= {name for name in self.cost if name.startswith(mirror)}
         taken: Counter[str] = Counter()
         ranked = []
         for name in sorted(names, key=lambda n: (self.cost[n], n)):
