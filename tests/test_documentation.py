@@ -8,6 +8,8 @@ import shlex
 import signal
 import subprocess
 import sys
+import tempfile
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 
@@ -107,14 +109,24 @@ def save_experiments(page):
 
 
 def install(page):
-    """Run the experiments of the installation on the page: its other blocks use their results."""
-    runs = re.findall(r"&& \.venv/bin/pbdkit run (\S+)$", page.read_text(), re.M)
-    for name in dict.fromkeys(runs):
+    """Save the results of the installation on the page, which its other blocks use."""
+    for name in re.findall(r"&& \.venv/bin/pbdkit run (\S+)$", page.read_text(), re.M):
+        for file, content in results_of(name).items():
+            Path(file).write_bytes(content)
+
+
+@cache
+def results_of(name):
+    """Return the files that the run of an experiment writes."""
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
         assert CliRunner().invoke(program, ["run", name]).exit_code == 0
+        return {file.name: file.read_bytes() for file in Path().iterdir()}
 
 
 @pytest.mark.parametrize(("page", "code"), blocks("python"))
-def test_python_examples_run(page, code, tmp_path, monkeypatch):
+def test_python_examples_run(page, code, tmp_path, monkeypatch, request):
+    if page.name == "testing.md":  # `testing/test_conformance` compiles
+        request.getfixturevalue("interpreted")
     monkeypatch.chdir(tmp_path)
     save_experiments(page)
     install(page)
