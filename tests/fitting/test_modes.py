@@ -45,7 +45,7 @@ def test_each_group_can_have_its_number(fit_with):
     found = fit_with(1e-6, [5, "auto"])
     assert found.modes() == {0: 5, 1: 4}
     assert found.solution.z.size == 1 + 2 * (5 + 4)
-    with pytest.raises(pbdkit.ExperimentError, match=r"^modes: expected a number for each"):
+    with pytest.raises(pbdkit.ExperimentError, match=r"^fit: modes: expected a number for each"):
         fit_with(1e-6, [5])
 
 

@@ -254,7 +254,7 @@ WRONG = {
     ),
     "a candidate without its unknown": (
         {"candidates": {"other": {"settings": {"rule": {"type": "springs"}}}}},
-        "^candidates.other: .*not a number of the experiment.* a separate `unknown`",
+        "^fit: candidates.other: .*not a number of the experiment.* a separate `unknown`",
     ),
 }  # fmt: skip
 
