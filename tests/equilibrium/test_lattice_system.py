@@ -1,11 +1,13 @@
 """Two ways to the linear system of a scene: stencils with multigrid, and a matrix with factors."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import pbdkit
+from pbdkit.equilibrium.krylov import best_of
 from pbdkit.equilibrium.lattice_system import SlowMode, lattice_system
 from pbdkit.equilibrium.sparse import MatrixSystem
 from pbdkit.equilibrium.stencil_matrix import (
@@ -164,3 +166,20 @@ def test_constrained_components_have_no_coupling_to_leaders():
     below = {"select": {"box": [5.5, -1.0, 20.5, 0.5]}, "motion": {"type": "hold"}, "axes": ["y"]}
     scene, rest = at_rest(LINEAR["elastic"] | {"leaders": [*PULL, below]})
     assert lattice_system(scene, rest, 1, Watch()).pushed_by(rest.u) is None
+
+
+@pytest.mark.parametrize("count", [0, 1, 3])
+@pytest.mark.parametrize("size", [1e-8, 1.0, 1e8])
+def test_the_start_of_an_iteration_leaves_a_residual_orthogonal_to_its_fields(count, size):
+    """The fields may have any sizes."""
+    generator = np.random.default_rng(count)
+    root = generator.normal(size=(12, 12))
+    K = root @ root.T + np.eye(12)
+    krylov = SimpleNamespace(product=lambda v: K @ v, dot=lambda v, w: float(v @ w))
+    fields = [scale * generator.normal(size=12) for scale in size ** np.arange(1.0, 1 + count)]
+    b = generator.normal(size=12)
+    residual = b.copy()
+    x = best_of(krylov, fields, residual) + np.zeros(12)
+    np.testing.assert_allclose(residual, b - K @ x, atol=1e-9)
+    for field in fields:
+        assert abs(field @ residual) <= 1e-9 * np.linalg.norm(field)

@@ -2,6 +2,7 @@
 
 import json
 from contextlib import contextmanager, nullcontext
+from types import SimpleNamespace
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -15,6 +16,7 @@ from pbdkit.equilibrium import (
     linear_solver,
     linearise as linearisation,
     load_stepping as increments,
+    multigrid,
     system as moves,
 )
 from pbdkit.equilibrium.load_stepping import equilibrate
@@ -226,3 +228,21 @@ def test_multigrid_detects_buckling(monkeypatch):
     pressed = sheet(20, 5, rule={"type": "springs"}, leaders=leaders, **HEXAGONAL)
     with pytest.raises(pbdkit.DivergedError, match="branches into several equilibria"):
         solved(pressed)
+
+
+@pytest.mark.parametrize("shape", [(40, 30), (40, 4), (4, 40), (4, 3)])
+@pytest.mark.parametrize("stiffness", [(1.0, 1.0), (1.0, 100.0), (100.0, 1.0)])
+def test_grids_are_halved_along_their_long_sides_and_stiff_couplings(shape, stiffness):
+    """Relaxation smooths errors along stiff couplings only."""
+    stencil = np.zeros((3, 3, 2, 2))
+    for axis, k in enumerate(stiffness):
+        ends = np.moveaxis(stencil, axis, 0)
+        ends[0, 1] -= k * np.eye(2)
+        ends[2, 1] -= k * np.eye(2)
+        stencil[1, 1] += 2.0 * k * np.eye(2)
+    grid = SimpleNamespace(stencils=stencil.reshape(1, 9, 2, 2), code=np.zeros(shape, np.int32))
+    halved = multigrid.StencilGrid.halved(grid, shape[0])
+    if min(shape) <= multigrid.MIN_PLACES:
+        assert halved == (shape[0] > shape[1], shape[1] > shape[0])
+    else:
+        assert halved == tuple(k == max(stiffness) for k in stiffness)
