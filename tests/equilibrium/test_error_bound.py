@@ -16,7 +16,7 @@ from scene_strategies import experiments, in_turn, samples
 
 import pbdkit
 from pbdkit.cli import program
-from pbdkit.equilibrium.error_bound import OVERDUE, Pace, _distance, _rate, _steps_until
+from pbdkit.equilibrium.error_bound import Pace
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state
@@ -506,38 +506,6 @@ def first_bound(lengths, tolerance, begin, most=10**6):
         if pace.is_near(pace.next_look, length, length):
             return checks, pace
     return checks, pace
-
-
-@pytest.mark.parametrize("ratio", [0.5, 0.99, 1.0, 1.1])
-@pytest.mark.parametrize("begin", [1, 40])
-def test_a_mode_has_the_rate_and_the_distance_of_its_steps(ratio, begin):
-    """The lengths of all following steps add up to the distance."""
-    rate = _rate((begin, ratio**begin), (begin + 7, ratio ** (begin + 7)))
-    if ratio >= 1.0:
-        assert rate == 0.0
-        return
-    assert rate == pytest.approx(-math.log(ratio))
-    following = sum(ratio**n for n in range(1, 5000))
-    assert _distance(1.0, rate) == pytest.approx(following)
-    assert _steps_until(1.0, ratio**10, rate) == pytest.approx(10.0)
-
-
-def test_a_state_at_rest_has_no_distance():
-    assert _rate((0, 1.0), (4, 0.0)) == math.inf
-    assert _distance(0.0, 0.0) == 0.0
-
-
-@pytest.mark.parametrize("begin", [0, 5000])
-@pytest.mark.parametrize("start", [50, 3000])
-def test_short_steps_that_do_not_decay_are_bounded_once(start, begin):
-    """The bound is computed after four times the steps before the first check with a short one,
-    which is up to a quarter later than the first of these steps."""
-    checks, pace = first_bound(lambda n: 1.5e-3 if n >= start else 1.0, 1e-3, begin, 10 * start)
-    short = next(n for n in checks if n >= start)
-    overdue = OVERDUE * short
-    assert short <= 1.25 * start + 1
-    assert overdue <= checks[-1] <= 1.25 * overdue + 1
-    assert pace.overdue == overdue
 
 
 @pytest.mark.parametrize("ratio", [0.5, 0.9, 0.99, 0.9999])

@@ -38,3 +38,8 @@ def test_ends_of_the_body_are_its_first_and_last_particle():
     X = raster.reference(raster.body_rows)
     np.testing.assert_array_equal(raster.body_ends(), X[[0, -1]])
     assert (X[0] != X[-1]).all()
+
+
+def test_all_lines_belong_to_the_only_process():
+    raster = raster_of({"type": "square", "a": 1.0})
+    assert raster.is_own(np.arange(-3, 20)).all()
