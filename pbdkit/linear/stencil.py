@@ -318,15 +318,16 @@ def _symbols(scene: Scene) -> Complex:
     Only one of each pair of opposite waves is included; both have the same eigenvalues.
     """
     stencil = linearised(scene)
-    angle, axes, sites = 2 * np.pi * np.arange(WAVES) / WAVES, scene.axes, len(stencil.centre)
-    waves = [angle[: WAVES // 2 + 1], *[angle] * (axes - 1)]
-    theta = np.stack(np.meshgrid(*waves, indexing="ij"), axis=-1).reshape(-1, axes)
+    axes, sites, numbers = scene.axes, len(stencil.centre), np.arange(WAVES)
+    along = [numbers[: WAVES // 2 + 1], *[numbers] * (axes - 1)]
+    waves = np.stack(np.meshgrid(*along, indexing="ij"), axis=-1).reshape(-1, axes)
     matrices = np.zeros((1 + len(stencil.neighbours), sites, axes, sites, axes), complex)
     matrices[0] = np.eye(sites * axes).reshape(matrices.shape[1:])
     for s, centre in enumerate(stencil.centre):
         matrices[0, s, :, s] += centre
     for n, (slot, matrix) in enumerate(stencil.neighbours.items(), 1):
         matrices[n, slot.source, :, slot.target] = matrix
-    cells = np.array([[0] * axes, *(slot.cell for slot in stencil.neighbours)], float)
-    symbols: Complex = np.exp(1j * theta @ cells.T) @ matrices.reshape(len(matrices), -1)
-    return symbols.reshape(len(theta), sites * axes, sites * axes)
+    cells = np.array([[0] * axes, *(slot.cell for slot in stencil.neighbours)])
+    phases = np.exp(2j * np.pi / WAVES * numbers)[waves @ cells.T % WAVES]
+    symbols: Complex = phases @ matrices.reshape(len(matrices), -1)
+    return symbols.reshape(len(waves), sites * axes, sites * axes)
