@@ -233,7 +233,10 @@ class PbdAccessor:
         columns = [n for n, v in parts.data_vars.items() if dim in v.dims and {*v.dims} <= dims]
         if not columns:
             names = ", ".join(sorted({str(d) for v in parts.data_vars.values() for d in v.dims}))
-            raise ExperimentError(f"no variable has only the dimension '{dim}'; it has: {names}")
+            text = f"no variable has only the dimension '{dim}'; there are {names}"
+            if dim == "bond" and "bond" not in parts.dims:
+                text += "; bonds are recorded if the experiment has `fracture` or `cuts`"
+            raise ExperimentError(text)
         coordinates = [
             name
             for name, v in parts.coords.items()

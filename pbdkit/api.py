@@ -342,6 +342,11 @@ def resume(
     from pbdkit.io.open import open
     from pbdkit.restart import resumption
 
+    if not isinstance(output, (str, Path)):
+        raise ExperimentError(
+            "resume: expected the name of the result file that a run was writing, got an object of "
+            f"type {type(output).__name__}; `pbdkit.rerun(ds)` runs the experiment of a dataset"
+        )
     path = Path(output)
     with progress_bar(progress) as show:
         resumed = resumption(path, Watch(show=show), steps=steps, anyway=anyway)

@@ -116,6 +116,8 @@ SLIPS: tuple[tuple[type[Exception], str, str], ...] = (
      "`total` contains the sums of the values that `gather` and `gather_pair` return"),
     (ValueError, "could not be broadcast",
      "compute one value for each particle, element by element from the arguments"),
+    (ValueError, "read-only",
+     "make new arrays, `x = x + 1` instead of `x += 1`"),
     (TypeError, "can be converted to Python scalars",
      "use functions of numpy, as `numpy.sqrt`, in place of those of `math`"),
     (TypeError, "'numpy.ndarray' object is not callable",

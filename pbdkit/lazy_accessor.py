@@ -58,6 +58,20 @@ class AccessorFinder:
 
 def _register(library: ModuleType) -> None:
     library.register_dataset_accessor("pbd")(_accessor_of)
+    library.register_dataarray_accessor("pbd")(_OfArray)
+
+
+class _OfArray:
+    """Accessor of a single variable, which has no methods."""
+
+    def __init__(self, array: xarray.DataArray) -> None:
+        self._name = array.name
+
+    def __getattr__(self, name: str) -> None:
+        raise AttributeError(
+            f"`pbd` belongs to datasets: write ds.pbd.{name}(...), with '{self._name}' as the name "
+            "of a variable"
+        )
 
 
 def _accessor_of(dataset: xarray.Dataset) -> PbdAccessor:

@@ -16,6 +16,7 @@ from typing import Any
 import click
 
 from pbdkit.cli.options import (
+    NUMBER,
     PATH,
     at_option,
     call,
@@ -51,7 +52,7 @@ LOOK = [
         "--range",
         "limits",
         nargs=2,
-        type=float,
+        type=NUMBER,
         metavar="LOW HIGH",
         default=None,
         help="Limits of the colour scale.",
@@ -76,7 +77,7 @@ LOOK = [
     click.option(
         "--window",
         nargs=4,
-        type=float,
+        type=NUMBER,
         metavar="X0 X1 Y0 Y1",
         default=None,
         help="Part of the plane to draw, in the units of the axes.",
@@ -85,7 +86,7 @@ LOOK = [
         "--size",
         "figsize",
         nargs=2,
-        type=float,
+        type=NUMBER,
         metavar="WIDTH HEIGHT",
         default=None,
         help="Size of the figure in inches.",

@@ -20,6 +20,25 @@ if TYPE_CHECKING:
 
 PATH = click.Path(path_type=Path)
 """Click type of paths."""
+
+
+class _Number(click.types.FloatParamType):
+    """Click type of numbers. An error repeats the help of the option, which has the unit."""
+
+    def convert(
+        self, value: Any, parameter: click.Parameter | None, context: click.Context | None
+    ) -> float:
+        """Return the number; a call of `fail` reports other text."""
+        try:
+            return float(value)
+        except ValueError:
+            help_ = getattr(parameter, "help", None)
+            form = f"; expected {parameter.metavar}: {help_}" if parameter and help_ else ""
+            self.fail(f"'{value}' is not a number{form}", parameter, context)
+
+
+NUMBER = _Number()
+"""Click type of numbers."""
 C = TypeVar("C", bound=click.Command)
 F = TypeVar("F", bound=Callable[..., Any])
 

@@ -70,10 +70,14 @@ def refuse_output(path: Path, *, force: bool, experiment: Path | None = None) ->
         raise ExperimentError(f"{path}: exists; --force replaces it, -o names another file")
 
 
-def refuse_unwritable(picture: Path | None, *files: Path | None) -> None:
-    """Raise ExperimentError or StorageError if a picture or another file cannot be written."""
+def refuse_unwritable(picture: Path | None, *files: Path | None, or_table: str = "") -> None:
+    """Raise ExperimentError or StorageError if a picture or another file cannot be written.
+    `or_table` is the suffix of tables that can be written in place of the picture."""
     if picture and picture.suffix not in FORMATS:
-        raise ExperimentError(f"{picture}: the name of a picture must end in {', '.join(FORMATS)}")
+        table = f", that of a table in {or_table}" if or_table else ""
+        raise ExperimentError(
+            f"{picture}: the name of a picture must end in {', '.join(FORMATS)}{table}"
+        )
     if picture:
         refuse_no_matplotlib()
     for path in (picture, *files):

@@ -105,7 +105,7 @@ def curve(
     is_table = path.suffix == TABLE
     refuse_output(path, force=force)
     refuse_no_matplotlib()
-    refuse_unwritable(None if is_table else path, path)
+    refuse_unwritable(None if is_table else path, path, or_table=TABLE)
     with reading(file, sweeps=True, at=at) as dataset:
         if is_table:
             write(path, _chart(dataset, kind, **options).csv().encode(), replace=force)

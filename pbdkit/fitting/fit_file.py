@@ -478,6 +478,12 @@ _some = TypeAdapter[tuple[MeasuredColumns, ...]](
 
 
 def _one_or_some(value: Any, info: ValidationInfo) -> tuple[MeasuredColumns, ...]:
+    if hasattr(value, "columns") or hasattr(value, "data_vars"):
+        raise ValueError(
+            f"expected keys such as `file`, got an object of type {type(value).__name__}; write it "
+            "to a CSV file, or pass it as `pbdkit.fit(..., measured=dataset)`, a table as "
+            "table.to_xarray()"
+        )
     if isinstance(value, Mapping):
         return (_one.validate_python(_typed(value), context=info.context),)
     if isinstance(value, (list, tuple)):
@@ -923,6 +929,11 @@ def read_fit(
     ExperimentError
         If the fit is invalid.
     """
+    if not isinstance(description, (Mapping, str, Path)):
+        raise ExperimentError(
+            "fit: expected a fit file, the name of a shipped fit or a dict with their keys, got an "
+            f"object of type {type(description).__name__}; measurements are given as `measured`"
+        )
     if isinstance(description, Mapping):
         path, source = Path("fit"), Source("fit", dict(description), {}, OF_PROGRAM)
     else:

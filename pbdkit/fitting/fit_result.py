@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pbdkit.array_types import Floats
-from pbdkit.errors import AccuracyWarning, WarningText
+from pbdkit.errors import AccuracyWarning, WarningText, did_you_mean
 from pbdkit.fitting.correlation import Correlation
 from pbdkit.fitting.crack_tip import LocatedTip
 from pbdkit.fitting.derived import Derived
@@ -185,7 +185,8 @@ class Misfit:
         )
         if not self.left_out:
             return text
-        return f"{text}; {self.left_out} rows are omitted: {self.left_out_because}"
+        rows = "row is" if self.left_out == 1 else "rows are"
+        return f"{text}; {self.left_out} {rows} omitted: {self.left_out_because}"
 
     @property
     def exceeds_noise(self) -> bool:
@@ -601,7 +602,7 @@ def fitted(fit: Fit, problem: Problem, solution: Solution) -> Fitted:
     modulus = youngs_modulus(fit.measured_force, problem, solution)
     several = combinations(problem, solution)
     return Fitted(
-        values,
+        _ByPath(values),
         correlations,
         modulus,
         misfits,
@@ -611,6 +612,15 @@ def fitted(fit: Fit, problem: Problem, solution: Solution) -> Fitted:
         combinations=several,
         beyond_bounds=steps_beyond_bounds(problem, solution, fit.loss),
     )
+
+
+class _ByPath(dict[str, Estimate]):
+    """Estimates by the path of the parameter."""
+
+    def __missing__(self, path: str) -> Estimate:
+        near = [name for name in self if name.endswith(f".{path}")]
+        hint = f"; write '{near[0]}'" if near else did_you_mean(path, self)
+        raise KeyError(f"there is no parameter '{path}'{hint} ({', '.join(self)})")
 
 
 def _excess_text(misfit: Misfit, n: int, several: bool) -> str:

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pbdkit.array_types import Floats
-from pbdkit.errors import WarningText
+from pbdkit.errors import ExperimentError, WarningText
 from pbdkit.fitting.fit_result import Fitted
 from pbdkit.fitting.problem import IDENTIFIABLE_RATIO, MODULUS
 from pbdkit.fitting.uncertainty import Estimate
@@ -342,6 +342,13 @@ def combine_specimens(fits: Mapping[str, Fitted]) -> FittedSpecimens:
         )
         for unknown in first.problem.unknowns
     }
+    for name, fit in fits.items():
+        if differing := sorted({*first.derived} ^ {*fit.derived}):
+            raise ExperimentError(
+                f"the specimens have different numbers of values: {differing[0]} exists in one of "
+                f"{next(iter(fits))} and {name} only; select values that exist in all, as K_I[0]",
+                ("derived",),
+            )
     derived = {
         formula: _mean_of({name: fit.derived[formula].estimate for name, fit in fits.items()})
         for formula in first.derived

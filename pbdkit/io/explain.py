@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pbdkit.array_types import Floats
 from pbdkit.components.fracture import Cohesive
 from pbdkit.components.stress_intensity import StressIntensity
-from pbdkit.errors import ExperimentError, StorageError
+from pbdkit.errors import AnswerError, ExperimentError, StorageError
 from pbdkit.io.layout import OF_FRAME, as_step
 from pbdkit.lattice.raster import Places
 from pbdkit.model.experiment import Experiment
@@ -177,7 +177,13 @@ class BondRecords:
             owner = Places(self._scene.raster.shape, self._scene.bonds.place[rows])
             fixed = constants.limits_at(plane.slot, n, owner)
             c = constants.of_bond(*fixed, *(values[rows] for values in memories))
-            limits[rows] = model.breaking_strain(plane.slot.rest, c, constants.fracture)
+            strains = np.asarray(model.breaking_strain(plane.slot.rest, c, constants.fracture))
+            if strains.shape not in ((), limits[rows].shape):
+                raise AnswerError(
+                    f"`breaking_strain` returned the shape {strains.shape} for "
+                    f"{limits[rows].size} bonds; return one number for each bond"
+                )
+            limits[rows] = strains
         return limits
 
     @cached_property

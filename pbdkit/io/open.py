@@ -15,6 +15,7 @@ from pbdkit.errors import (
     StorageError,
     StorageWarning,
     WriteError,
+    did_you_mean,
     one_line,
     reason_of,
     warn_caller,
@@ -103,11 +104,10 @@ def refuse_no_file(file: Path) -> None:
     if file.is_dir():
         raise StorageError(f"{file}: is a folder, not a result of pbdkit")
     if not file.is_file():
-        what = (
-            "is not a plain file, and not a result of pbdkit"
-            if file.exists()
-            else "there is no such file"
-        )
+        what = "is not a plain file, and not a result of pbdkit"
+        if not file.exists():
+            beside = sorted(path.name for path in file.parent.glob("*.nc"))
+            what = f"there is no such file{did_you_mean(file.name, beside)}"
         raise StorageError(f"{file}: {what}")
 
 

@@ -44,7 +44,11 @@ def other_file(path: Path) -> str:
     if kind == EXPERIMENT:
         return f"is an experiment; `pbdkit run {path}` computes its result and prints the path"
     description = f"is {kind}, not a result; {command_for(kind, str(path))}"
-    return description if kind else "is not a result; the names of results end in .nc"
+    if kind:
+        return description
+    if path.suffix == ".json":
+        return "is not a result; `pbdkit fit FILE --plot OUT.png` draws a fit while it is made"
+    return "is not a result; the names of results end in .nc"
 
 
 def is_experiment(path: Path) -> bool:

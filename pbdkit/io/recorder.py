@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pbdkit.components.diagnostics import Displacement
-from pbdkit.errors import AccuracyWarning, PluginError, WarningText
+from pbdkit.errors import AccuracyWarning, AnswerError, PluginError, WarningText, did_you_mean
 from pbdkit.hooks import pbdkit_version
 from pbdkit.io import layout
 from pbdkit.io.checkpoint import RecordedSteps
@@ -27,7 +27,7 @@ from pbdkit.model.experiment import Experiment
 from pbdkit.model.solver import OpeningControl
 from pbdkit.plugin import Diagnostic, Moment, RenewsBonds, RenewsParticles, Variable
 from pbdkit.plugin.component import as_values
-from pbdkit.plugin.discovery import errors_attributed_to
+from pbdkit.plugin.discovery import errors_attributed_to, full_description
 from pbdkit.scene.constants import bond_numbers, particle_numbers
 from pbdkit.scene.opening import Opening
 from pbdkit.scene.scene import Scene
@@ -133,6 +133,7 @@ class RecordedVariables:
                     raise PluginError(
                         f"{whose} the variable '{variable.name}' with the dimension "
                         f"'{unknown[0]}', for which it defines no coordinate"
+                        + (did_you_mean(unknown[0], dims - {""}) or "; define it in `coordinates`")
                     )
                 columns.append(layout.diagnostic_column(variable, diagnostic))
         return columns
@@ -189,12 +190,10 @@ class RecordedVariables:
                         sizes.setdefault(dimension, np.shape(value)[variable.dims.index(dimension)])
                     shape = tuple(sizes.get(dim, -1) for dim in variable.dims)
                     if np.shape(value) != shape:
-                        raise ValueError(
-                            f"'{variable.name}' has the shape {np.shape(value)}, expected {shape}"
-                        )
+                        raise AnswerError(_other_shape(variable, np.shape(value), shape))
                     if when is not When.END:
                         _refuse_infinite(
-                            variable, value, moment, self._scene.raster.particle_offset
+                            diagnostic, variable, value, moment, self._scene.raster.particle_offset
                         )
                     values[variable.name] = (
                         np.array(value) if factor == 1.0 else np.multiply(value, factor)
@@ -213,13 +212,30 @@ def _reserve_name(name: str, names: set[str], what: str) -> None:
     names.add(name)
 
 
-def _refuse_infinite(variable: Variable, value: Any, moment: Moment, offset: int) -> None:
+def _other_shape(variable: Variable, shape: tuple[int, ...], expected: tuple[int, ...]) -> str:
+    """Return the message for values of a wrong shape."""
+    text = f"`measure` returned the shape {shape} for '{variable.name}', expected {expected}"
+    if "particle" in variable.dims:
+        return f"{text}; return a value for each particle, and NaN at frame points"
+    dims = f"({', '.join(variable.dims)})" if variable.dims else "(), a single number"
+    return f"{text}; it is declared with the dims {dims}"
+
+
+def _refuse_infinite(
+    diagnostic: Diagnostic, variable: Variable, value: Any, moment: Moment, offset: int
+) -> None:
     valid = variable.is_recordable(value, moment.inside)
     if not valid.all():
         place = np.argwhere(~valid)[0]
         whose = (
             f"particle {offset + place[0] + 1}" if variable.dims[:1] == ("particle",) else "the run"
         )
+        if moment.step == 0:  # Later the state may have diverged.
+            raise PluginError(
+                f"{full_description(type(diagnostic))} failed at step {moment.step}: `measure` "
+                f"returned {np.asarray(value)[tuple(place)]:g} as '{variable.name}' of {whose}; "
+                "guard divisions, or declare the variable with `may_be_nan=True`"
+            )
         raise FloatingPointError(f"{variable.name} of {whose} at step {moment.step}")
 
 

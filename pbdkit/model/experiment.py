@@ -551,7 +551,12 @@ class Experiment(Strict):
     _validated: dict[str, Any] = PrivateAttr(default_factory=dict)
     _registry: Registry = PrivateAttr()
 
-    def __init__(self, **parts: Any) -> None:
+    def __init__(self, *positional: Any, **parts: Any) -> None:
+        if positional:
+            raise ExperimentError(
+                "Experiment: expected parts by keyword, as lattice=...; pbdkit.load(...) returns "
+                "the experiment in a file, and Experiment(**parts) that of a dict"
+            )
         self._validate(parts, Registry(), Source(files=OF_PROGRAM))
 
     @model_serializer(mode="wrap")
@@ -584,7 +589,17 @@ class Experiment(Strict):
             Raw data with their places in a file.
         components
             Component classes in addition to the installed ones.
+
+        Raises
+        ------
+        ExperimentError
+            If the experiment is invalid.
         """
+        if not isinstance(source, Source):
+            raise ExperimentError(
+                f"Experiment.build: expected a source of data with their places, got "
+                f"{type(source).__name__}; write Experiment(**parts), or pbdkit.load(...)"
+            )
         experiment = cls.__new__(cls)
         experiment._validate(source.data, Registry(components), source)
         return experiment

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from functools import lru_cache, reduce
 from operator import or_
@@ -189,6 +189,10 @@ def _described(fault: Any) -> tuple[tuple[str | int, ...], str]:
     if "text" in context:
         key = context.get("key", ())
         return (*where, *(key if isinstance(key, tuple) else (key,))), context["text"]
+    if fault["type"] == "missing" and where and isinstance(where[-1], int):
+        return where, f"is missing; the list needs {where[-1] + 1} entries"
+    if context.get("actual_length", 0) is None:
+        context |= {"actual_length": np.size(fault["input"])}
     if fault["type"] in PLAIN:
         text = PLAIN[fault["type"]].format(got=brief(fault["input"]), **context)
         return where, text + (_decimal_commas(fault) or _as_list(fault))
@@ -211,6 +215,8 @@ def _described(fault: Any) -> tuple[tuple[str | int, ...], str]:
 def _as_list(fault: Any) -> str:
     """Return a hint if a value is given where a list is expected."""
     value = fault["input"]
+    if fault["type"] == "dict_type" and isinstance(value, str):
+        return f"; write {{{value}: ...}}"
     if fault["type"] != "tuple_type" or value is None:
         return ""
     if isinstance(value, dict):
@@ -280,7 +286,13 @@ def open_part(interface: type[Component]) -> BeforeValidator:
 
     def build(value: Any, info: ValidationInfo) -> Any:
         registry: Registry = (info.context or {}).get("registry") or Registry()
-        part = _build(value, interface, lambda name: registry.find(interface, name), info)
+        part = _build(
+            value,
+            interface,
+            lambda name: registry.find(interface, name),
+            info,
+            lambda: sorted(names[0] for names in registry.spellings(interface).values()),
+        )
         try:
             part.model_dump_json()
         except (Exception, SystemExit) as error:
@@ -302,12 +314,18 @@ def closed_part(base: type[Component], *members: type[Component]) -> BeforeValid
         return by_name[name]
 
     return BeforeValidator(
-        lambda value, info: _build(value, base, find, info),
+        lambda value, info: _build(value, base, find, info, lambda: by_name),
         json_schema_input_type=reduce(or_, members),
     )
 
 
-def _build(value: Any, base: type[Component], find: Finder, info: ValidationInfo) -> Any:
+def _build(
+    value: Any,
+    base: type[Component],
+    find: Finder,
+    info: ValidationInfo,
+    types: Callable[[], Iterable[str]],
+) -> Any:
     if isinstance(value, base):
         return value
     if not isinstance(value, dict):
@@ -316,7 +334,7 @@ def _build(value: Any, base: type[Component], find: Finder, info: ValidationInfo
         raise fault(f"expected {{type: ..., its parameters}}, got {brief(value)}{hint}")
     name = value.get("type")
     if name is None:
-        raise fault("`type` is missing")
+        raise fault(f"`type` is missing; it is one of {', '.join(types())}")
     if not isinstance(name, str):
         raise fault(f"expected a word, got {brief(name)}", key="type")
     if len(name) > MAX_TYPE:

@@ -29,7 +29,15 @@ from pbdkit.array_types import Array, Floats
 from pbdkit.errors import ExperimentError
 from pbdkit.io.layout import INDICES, rows_at, scene_of
 from pbdkit.io.members import STATUS, SWEEP, TEXT, type_alone, with_experiment
-from pbdkit.plotting.data import CHOSEN_BY, OF_A_RUN, SUM_BLOCK_BYTES, in_units, scalar, variable
+from pbdkit.plotting.data import (
+    CHOSEN_BY,
+    OF_A_RUN,
+    SUM_BLOCK_BYTES,
+    drawn_by_curve,
+    in_units,
+    scalar,
+    variable,
+)
 from pbdkit.plotting.figure_layout import new_figure
 from pbdkit.plotting.style import in_its_units, label, plain, signed
 from pbdkit.scene.scene import Scene
@@ -449,6 +457,8 @@ def curve_chart(
     obstacle."""
     if y is None:
         x, y = None, x
+    if y not in dataset and (meant := str(y).replace("_", "-")) in KINDS:
+        raise ExperimentError(f"there is no variable '{y}'; a kind is given as kind='{meant}'")
     if y is not None and kind is not None:
         raise ExperimentError(f"give either y or the kind '{kind}', not both")
     if y is not None:
@@ -603,7 +613,7 @@ def _of_particles(dataset: xarray.Dataset, name: str, wanted: list[int] | None) 
     from_positions = name.partition("_")[0] == "u" and "u" not in dataset.variables
     values = variable(dataset, name.replace("u", "position", 1) if from_positions else name)
     if dim not in values.dims:
-        raise ExperimentError(f"'{name}' has no values at particles; `curve` draws it")
+        raise ExperimentError(f"'{name}' has no values at particles; {drawn_by_curve(name)}")
     numbers, followed = dataset[dim].values, []
     for number in numbers if wanted is None else wanted:
         if number not in numbers:

@@ -413,6 +413,11 @@ def refuse_color(
             "the kinds of particles, which are drawn by default, were not recorded; select a "
             f"variable with --color, in Python with color=: {', '.join(names)}"
         )
+    if name in dataset.data_vars:
+        raise ExperimentError(
+            f"'{name}' cannot be drawn over the body, because it has no values at particles or "
+            f"bonds; {drawn_by_curve(name)}"
+        )
     vectors = [n for n in (*names, *drawable) if "axis" in dataset[n].dims]
     parts = [f"{n}_{axis}" for n in vectors for axis in axes]
     suggestion = did_you_mean(name, [*drawable, *parts]) or ";"
@@ -420,6 +425,15 @@ def refuse_color(
         f"'{name}' cannot be drawn{suggestion} drawable: {', '.join(names)}; of vectors also the "
         f"components, as {parts[0]}"
     )
+
+
+def drawn_by_curve(name: str) -> str:
+    """Return the remedy for a variable that is drawn over the steps."""
+    return f"`pbdkit curve OUT.nc --y {name}`, in Python ds.pbd.curve('{name}'), draws it"
+
+
+OF_CONTROL = ("opening", "load_factor", "dissipated_energy")
+"""Variables of runs with a control of the load."""
 
 
 def makers_of_missing(dataset: xarray.Dataset, name: str) -> list[str]:
@@ -878,6 +892,11 @@ def _unknown(dataset: xarray.Dataset, name: str, axes: list[str]) -> str:
         return (
             f"'{name}' was not recorded; add {' or '.join(makers)} to `diagnostics`, and run the "
             "experiment again"
+        )
+    if name in OF_CONTROL:
+        return (
+            f"'{name}' was not recorded; it is recorded with solver: {{type: equilibrium, control: "
+            "...}"
         )
     suggestion = did_you_mean(name, names) or ";"
     return f"there is no variable '{name}'{suggestion} available: {', '.join(names)}"

@@ -141,7 +141,7 @@ def checked(component: Any) -> Offer:
     """
     if isinstance(component, Component):
         name = type(component).__name__
-        raise TypeError(f"the hook returned an object of {name}; return the class {name}")
+        raise TypeError(f"expected the class {name}, got an object of it; give {name}")
     interfaces = tuple(INTERFACES.values())
     if not (inspect.isclass(component) and issubclass(component, interfaces)):
         raise TypeError(f"{component!r} does not implement an interface of pbdkit")
@@ -151,8 +151,9 @@ def checked(component: Any) -> Offer:
             f"{label} has the type '{name}'; a type must begin with a letter or digit and contain "
             "only letters, digits, '.', '_' and '-'"
         )
-    if missing := ", ".join(sorted(getattr(component, "__abstractmethods__", ()))):
-        raise TypeError(f"{label} does not define {missing}")
+    if missing := sorted(getattr(component, "__abstractmethods__", ())):
+        forms = ", ".join(f"{name}{_arguments(component, name)}" for name in missing)
+        raise TypeError(f"{label} does not define {forms}")
     _check_functions(component)
     try:
         component.model_json_schema()
@@ -161,6 +162,12 @@ def checked(component: Any) -> Offer:
         raise TypeError(f"the parameters of {label} {why}") from None
     _check_defaults(component)
     return offer_of(component)
+
+
+def _arguments(component: type[Component], name: str) -> str:
+    """Return the arguments of a function of an interface in parentheses."""
+    parameters = inspect.signature(getattr(component, name)).parameters
+    return f"({', '.join(parameters)})"
 
 
 FUNCTIONS = (types.FunctionType, staticmethod, classmethod)

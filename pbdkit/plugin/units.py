@@ -326,7 +326,8 @@ def magnitude(text: str, unit: str, meaning: str) -> float:
                     "steps have no duration; write the change in one step, without the unit of "
                     f"time, as in 0.01 {unit}"
                 )
-        raise _fault(f"'{text}' is not a {meaning}; {hint}") from None
+        article = "an" if meaning[:1] in "aeiou" else "a"
+        raise _fault(f"'{text}' is not {article} {meaning}; {hint}") from None
 
 
 def is_unit(name: str) -> bool:

@@ -212,7 +212,8 @@ def _draw(scene: Scene, field: str, numbers: Sequence[Remembered], values: Value
             if np.shape(value) != (len(owners),) or not np.isfinite(value).all():
                 raise PluginError(
                     f"'{part.type}' draws '{name}' with the shape {np.shape(value)}, finite: "
-                    f"{bool(np.isfinite(value).all())}; expected ({len(owners)},) finite numbers"
+                    f"{bool(np.isfinite(value).all())}; expected ({len(owners)},) finite numbers, "
+                    "one for each of `owners`"
                 )
             array_of[name].reshape(-1)[place] = value
 

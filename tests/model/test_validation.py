@@ -86,7 +86,7 @@ EDITS = {
     "misspelt body": ("grid", "gird", "e.yaml:4:8: body.type: unknown type 'gird'; did you mean 'grid'? (known: ..."),
     "misspelt motion": ("hold", "hodl", "e.yaml:10:37: leaders.0.motion.type: unknown type 'hodl'; did you mean 'hold'? (known: ..."),
     "misspelt edge": ("left", "lft", "e.yaml:10:15: leaders.0.select.edge: should be 'left', 'right', 'bottom' or 'top', got 'lft'; did you mean 'left'?"),
-    "no type": ("{type: mean}", "{}", "e.yaml:7:1: frame: `type` is missing"),
+    "no type": ("{type: mean}", "{}", "e.yaml:7:1: frame: `type` is missing; it is one of first, mean, mirror, natural, none"),
     "type a number": ("{type: mean}", "{type: 3}", "e.yaml:7:9: frame.type: expected a word, got 3"),
     "a word for a part": ("{type: mean}", "mean", "e.yaml:7:1: frame: expected {type: ..., its parameters}, got 'mean'; write {type: mean}"),
     "nothing for a part": ("{type: mean}", "", "e.yaml:7:1: frame: expected {type: ..., its parameters}, got None"),

@@ -191,7 +191,7 @@ def test_crack_of_a_part_of_a_body_is_between_its_particles(torn):
         ({"particle": 999}, "there is no particle 999; the dataset has 56 particles"),
         ({"particle": 3, "i": 1}, "either by number or by i and j, not by both"),
         ({"i": 77, "j": 1}, "there is no particle at i=77, j=1"),
-        ({"name": "broken_bonds", "particle": 3}, "no values at particles; `curve` draws it"),
+        ({"name": "broken_bonds", "particle": 3}, "no values at particles; `pbdkit curve OUT"),
         ({"name": "stress_xx", "particle": 3}, "add {type: stress, youngs_modulus: ...} to"),
         ({"name": "pe11", "particle": 3}, "did you mean 'pe1'?"),
         ({"bond": (1, 2, 3)}, "given by two numbers of particles, got [1, 2, 3]"),

@@ -244,7 +244,7 @@ class Odd(pbdkit.Diagnostic):
 
 
 def test_own_dimension_has_one_length():
-    with pytest.raises(pbdkit.PluginError, match=r"'other' has the shape \(4,\), expected \(3,\)"):
+    with pytest.raises(pbdkit.PluginError, match=r"shape \(4,\) for 'other', expected \(3,\)"):
         pbdkit.run(SHEET | {"diagnostics": [Odd()]}, progress=False)
 
 
