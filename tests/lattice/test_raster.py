@@ -1,9 +1,13 @@
 """Rows of particles on the boundary of a body, against loops over its sites."""
 
+from dataclasses import replace
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
 import pbdkit
+from pbdkit.lattice.raster import RowRange
 from pbdkit.scene.scene import build_scene
 
 RAGGED = {"type": "polygon", "vertices": [[0.0, 0.0], [9.0, 2.0], [6.0, 7.0], [2.0, 5.0]]}
@@ -40,6 +44,12 @@ def test_ends_of_the_body_are_its_first_and_last_particle():
     assert (X[0] != X[-1]).all()
 
 
-def test_all_lines_belong_to_the_only_process():
-    raster = raster_of({"type": "square", "a": 1.0})
-    assert raster.is_own(np.arange(-3, 20)).all()
+@pytest.mark.parametrize("ends", [[], [4], [2, 5, 6]])
+def test_each_line_belongs_to_one_process(ends):
+    whole, far = raster_of({"type": "square", "a": 1.0}), 20
+    rasters = [whole]
+    if ends:
+        parts = pairwise([-far, *ends, far])
+        rasters = [replace(whole, row_range=RowRange(None, part, part)) for part in parts]
+    lines = np.arange(-3, far - 1)
+    assert (sum(raster.is_own(lines).astype(int) for raster in rasters) == 1).all()
