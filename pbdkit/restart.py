@@ -445,6 +445,7 @@ def _continued(
                 ][-1]
             recorder.begin(records)
             restore(run.driver, recorder, checkpoint, communicator, recorded)
+            _ = run.warnings  # cached; an error in them must not leave the file of the sink
         except BaseException:
             recorder.sink.abandon()
             raise

@@ -18,6 +18,7 @@ from pbdkit.errors import (
     did_you_mean,
     one_line,
     reason_of,
+    unreadable,
     warn_caller,
 )
 from pbdkit.io.layout import SCHEMA_VERSION, base_columns, in_this_layout, json_attribute
@@ -159,7 +160,7 @@ def reading(
     sweep from which no member is selected, unless `sweeps` is true. Errors of pbdkit in the block,
     such as a WriteError of another file, keep their type. Any other error in the block is raised as
     a StorageError: since files are correct when they are written, the error must be caused by
-    damage.
+    damage, or by the disk if it is an error of the system.
     """
     with open(path) as whole:
         dataset = _chosen(whole, path, at) if at else whole
@@ -183,6 +184,8 @@ def reading(
                     f"{path}: this requires `{name}`, which the sweep did not keep; add "
                     f"{kept_with} to keep.variables, and run the sweep again"
                 ) from None
+            if isinstance(error, OSError) and error.errno:
+                raise unreadable(path, error) from None
             reason = f"{type(error).__name__}: {error}"
             raise StorageError(f"{path}: is damaged, or was changed: {one_line(reason)}") from error
 

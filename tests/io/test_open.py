@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -13,6 +15,7 @@ import pytest
 from scene_strategies import in_turn
 
 import pbdkit
+from pbdkit.io.open import reading
 from pbdkit.untrusted_files import try_reading
 
 Call = Callable[..., Any]
@@ -139,3 +142,12 @@ def test_file_without_the_end_of_its_seal_gives_a_warning(sound: Path, call: Cal
     result = call("explain", "cut.nc")
     assert (result.code, result.out) == (0, call("explain", str(sound)).out)
     assert result.err.startswith("warning: cut.nc: has no seal")
+
+
+def test_failing_disk_is_not_damage(tmp_path: Path) -> None:
+    path = tmp_path / "out.nc"
+    pbdkit.run("paper/a", settings={"steps": 2}, output=path, progress=False)
+
+    message = r"out.nc: cannot be read: Input/output error"
+    with pytest.raises(pbdkit.StorageError, match=message), reading(path):
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
