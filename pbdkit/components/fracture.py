@@ -426,9 +426,9 @@ _DAMAGE = Remembered("damage", "damage of the bond, from 0 to 1 where it is brok
 """Declaration of the damage of a bond."""
 
 
-CROSSED = 0.09
-"""A crack crosses a bond if the squared cosine between the bond and the normal of the crack exceeds
-this number."""
+LEAST = 0.25
+"""Smallest squared cosine between a bond and the normal of a crack in the strain of the bond across
+the crack."""
 DIRECTIONS = 360
 """Number of crack directions for which the largest admissible lattice constant is computed."""
 LISTED = (0, 15, 30, 45, 90)
@@ -545,16 +545,20 @@ Law = Annotated[
 
 
 class Cohesive(UsesStiffness, SoftensCells, Parting):
-    """A cell softens once its largest principal stress exceeds `onset` times Young's modulus.
+    """Bonds soften by the opening of a crack that crosses them.
 
-    Softening localises in a band one cell wide. The band is torn when it has dissipated `energy`
-    per unit length of the crack. The stress is the effective stress, that of the undamaged cell.
-    When its largest principal value reaches the onset, the principal direction becomes the normal e
-    of the crack in the cell and does not change any more. A bond with the unit vector n crosses the
-    crack if |n · e| > 0.3. The force of such a bond in the cell is reduced by the damage D = 1 -
-    σ/κ. Here κ is the principal stress divided by Young's modulus, as the maximum over time, and σ
-    is the stress that the softening law has at the same strain. For the law `linear`, D = failure /
-    (failure - onset) (1 - onset / κ). Other bonds of the cell are not damaged.
+    A bond softens once the stress across a crack at the bond exceeds `onset` times Young's modulus.
+    Softening localises in a band one cell wide, which is torn when it has dissipated `energy` per
+    unit length of the crack. The stress is the effective stress, that of the undamaged cell. The
+    normal e of the crack is the direction of the largest principal stress at the bond when
+    softening begins, and does not change any more.
+
+    The force of the bond in the cell is reduced by the damage D = 1 - σ/κ. Here κ is the strain of
+    the bond across the crack as the maximum over time: (ε - ε_t (n · t)²) / (n · e)², with the
+    strain ε of the bond along its unit vector n and the mean strain ε_t along the crack, plus the
+    lateral contraction of the cell. σ is the stress that the softening law has at the same strain.
+    For the law `linear`, D = failure / (failure - onset) (1 - onset / κ). Bonds along the crack are
+    not damaged.
 
     The law is the stress as a function of the opening of the crack, w: `linear`; `bilinear`, with a
     kink at a third of the strength and the opening 0.8 G_c / f_t (Petersson 1981); `exponential`;
@@ -562,10 +566,10 @@ class Cohesive(UsesStiffness, SoftensCells, Parting):
     scaled such that the area under the law is the fracture energy, and stresses such that the first
     is the strength.
 
-    The opening is the cracking strain of the cell times the width of the band, which is the width
-    of the cell along e (Bažant and Oh 1983, Oliver 1989). The strain at which the cell fails
-    follows from the energy if the band does not contract along the crack. A bond is broken when D =
-    1 in all cells beside it. Cracks do not close under compression.
+    The opening is the cracking strain times the length of the bond across the crack, |r · e|, as in
+    a crack band (Bažant and Oh 1983, Oliver 1989) whose width is that of each bond. The failure
+    strain follows from the energy if the band does not contract along the crack. A bond is broken
+    when D = 1 in both cells beside it. Cracks do not close under compression.
     """
 
     other_names: ClassVar[Mapping[str, str]] = {"strength": "onset"}
@@ -642,13 +646,12 @@ class Cohesive(UsesStiffness, SoftensCells, Parting):
         return {"onset_strain": self.onset}
 
     def of_material(self, slot: Slot, rule: Calibrated, setting: Setting) -> dict[str, float]:
-        """Return the constants of the softening law and of the bonds of a cell.
+        """Return the constants of the softening law.
 
         - `release` is a length, 2 energy / onset times the stiffness along x divided by the squared
           modulus along x.
         - `along_y` and `across` are compliances divided by the compliance along x.
         - `stiff_y` and `stiff_across` are stiffnesses divided by the stiffness along x.
-        - `x0` to `y2` are the vectors of the bonds of a cell.
 
         Raises
         ------
@@ -657,7 +660,6 @@ class Cohesive(UsesStiffness, SoftensCells, Parting):
             crack the failure strain does not exceed the onset.
         """
         release, ratios = _material(rule)
-        bonds = _bonds_of_a_cell(setting)
         room = float(self._room(rule, setting, np.arange(DIRECTIONS) * np.pi / DIRECTIONS).min())
         if room <= 1.0:
             raise ExperimentError(
@@ -668,11 +670,11 @@ class Cohesive(UsesStiffness, SoftensCells, Parting):
                 f"{self.energy / room:.3g}",
                 ("energy",),
             )
-        cell = {f"x{n}": float(r.x) for n, r in enumerate(bonds)}
-        cell |= {f"y{n}": float(r.y) for n, r in enumerate(bonds)}
         names = ("along_y", "across", "stiff_y", "stiff_across")
-        anisotropy = dict(zip(names, ratios, strict=True))
-        return {"release": 2.0 * self.energy * release / self.onset, **anisotropy, **cell}
+        return {
+            "release": 2.0 * self.energy * release / self.onset,
+            **dict(zip(names, ratios, strict=True)),
+        }
 
     def spacing_limits(self, rule: Calibrated, setting: Setting) -> SpacingLimits:
         """Return the largest lattice constants for cracks in some directions, and the length of the
@@ -693,45 +695,46 @@ class Cohesive(UsesStiffness, SoftensCells, Parting):
         so that its strain would have to decrease along the steepest part of the law.
         """
         release, ratios = _material(rule)
-        cos, sin = np.cos(2 * angles), np.sin(2 * angles)
-        bonds = _bonds_of_a_cell(setting)
-        size = np.sqrt(np.max([_projection(r, cos, sin) for r in bonds], axis=0))
-        flexibility, stiffness = (_along(cos, sin, *pair) for pair in (ratios[:2], ratios[2:]))
+        normal = Vector(np.cos(angles), np.sin(angles))
+        extents = [abs(r.x * normal.x + r.y * normal.y) for r in _bonds_of_a_cell(setting)]
+        size = np.max(extents, axis=0)
+        flexibility, stiffness = (_along(normal, *pair) for pair in (ratios[:2], ratios[2:]))
         size = size / (flexibility * flexibility * stiffness)
         steepest = self.softening.steepest
         room: Floats = self.energy * release / (steepest * size * self.onset**2)
         return room
 
     def remembered(self) -> tuple[Remembered, ...]:
-        """Declare the damage and the failure strain of each bond in the cells on both sides.
-
-        A negative failure strain marks a cell with a crack that does not cross the bond.
-        """
+        """Declare the damage of each bond, and the normal of the crack, in the cells on both
+        sides."""
         return _NUMBERS
 
     @staticmethod
     def update(  # type: ignore[override]  # models of SoftensCells receive the cells
         d: Vector, r: Vector, c: Constants, p: Parameters, left: CellStress, right: CellStress
     ) -> tuple[Number, ...]:
-        """Return damage and failure strain in both cells.
+        """Return the damage of the bond and the normal of the crack in both cells.
 
         If there is a cell on one side only, both sides have its values.
         """
-        left_damage, left_failure = _of_cell(left, c.damage_left, c.failure_left, r, c, p)
-        right_damage, right_failure = _of_cell(right, c.damage_right, c.failure_right, r, c, p)
+        before = c.damage_left, c.normal_x_left, c.normal_y_left
+        of_left = _of_cell(left, *before, r, c, p)
+        before = c.damage_right, c.normal_x_right, c.normal_y_right
+        of_right = _of_cell(right, *before, r, c, p)
         has_left, has_right = left.share > 0.0, right.share > 0.0
         return (
-            where(has_left, left_damage, right_damage),
-            where(has_right, right_damage, left_damage),
-            where(has_left, left_failure, right_failure),
-            where(has_right, right_failure, left_failure),
+            where(has_left, of_left[0], of_right[0]),
+            where(has_right, of_right[0], of_left[0]),
+            where(has_left, of_left[1], of_right[1]),
+            where(has_right, of_right[1], of_left[1]),
+            where(has_left, of_left[2], of_right[2]),
+            where(has_right, of_right[2], of_left[2]),
         )
 
     @staticmethod
-    def load(stress: CellStress, c: Constants, p: Parameters) -> Number:
+    def load(stress: CellStress, r: Vector, c: Constants, p: Parameters) -> Number:
         """Return κ divided by the onset."""
-        largest, cos, sin = _principal(stress)
-        return largest * _along(cos, sin, c.along_y, c.across) / c.onset_strain
+        return _strain(stress, r, _normal(stress, r), c) / c.onset_strain
 
     @staticmethod
     def breaks(d: Vector, r: Vector, c: Constants, p: Parameters) -> Condition:
@@ -739,24 +742,70 @@ class Cohesive(UsesStiffness, SoftensCells, Parting):
         return (c.damage_left >= 1.0) & (c.damage_right >= 1.0)
 
 
-def _of_cell(stress: CellStress, damage: Any, failure: Any, r: Any, c: Any, p: Any) -> Any:
-    """Return damage and failure strain of a bond in a cell under a stress."""
-    largest, cos, sin = _principal(stress)
-    flexibility = _along(cos, sin, c.along_y, c.across)
-    strain = largest * flexibility
-    size = _projection(Vector(c.x0, c.y0), cos, sin)
-    other = _projection(Vector(c.x1, c.y1), cos, sin)
-    size = where(other > size, other, size)
-    other = _projection(Vector(c.x2, c.y2), cos, sin)
-    size = np.sqrt(where(other > size, other, size))
-    stiffness = _along(cos, sin, c.stiff_y, c.stiff_across)
-    crack_failure = c.release * flexibility * flexibility * stiffness / size * p.stretch
-    crossed = _projection(r, cos, sin) > CROSSED * squared_length(r)
-    begins = (failure == 0.0) & (strain > c.onset_strain) & (stress.share > 0.0)
-    failure = where(begins, where(crossed, crack_failure, -crack_failure), failure)
-    crosses = failure > 0.0
-    fails = where(crosses, failure, 2.0 * p.stretch * c.onset_strain)
-    return where(crosses, _damage(strain, c.onset_strain, fails, damage, p), damage), failure
+def _of_cell(
+    stress: CellStress, damage: Any, normal_x: Any, normal_y: Any, r: Any, c: Any, p: Any
+) -> Any:
+    """Return the damage of a bond and the normal of its crack, in a cell under a stress."""
+    softens = (normal_x != 0.0) | (normal_y != 0.0)
+    normal = _normal(stress, r)
+    normal = Vector(where(softens, normal_x, normal.x), where(softens, normal_y, normal.y))
+    strain = _strain(stress, r, normal, c)
+    softens = softens | ((strain > c.onset_strain) & (stress.share > 0.0))
+    flexibility = _along(normal, c.along_y, c.across)
+    stiffness = _along(normal, c.stiff_y, c.stiff_across)
+    failure = c.release * flexibility * flexibility * stiffness * p.stretch
+    failure = failure / np.sqrt(_squared_extent(r, normal))
+    failure = where(softens, failure, 2.0 * p.stretch * c.onset_strain)
+    damage = where(softens, _damage(strain, c.onset_strain, failure, damage, p), damage)
+    return damage, where(softens, normal.x, 0.0), where(softens, normal.y, 0.0)
+
+
+def _normal(stress: CellStress, r: Vector) -> Vector:
+    """Return the normal of a crack that begins at a bond.
+
+    It is the direction of the largest principal value of the mean stress of the cell and, if the
+    bond is stretched more than the cell, of a tension along the bond. The tension is the difference
+    of the strains over LEAST, as in `_strain` for a bond along the crack.
+    """
+    x, y, square = r.x * r.x, r.y * r.y, squared_length(r)
+    mean = stress.strain_xx * x + stress.strain_yy * y + 2.0 * stress.strain_xy * r.x * r.y
+    more = stress.strain - mean / square
+    more = where(more > 0.0, more, 0.0) / (LEAST * square)
+    half = 0.5 * (stress.xx - stress.yy + more * (x - y))
+    xy = stress.xy + more * r.x * r.y
+    radius = np.sqrt(half * half + xy * xy)
+    has_direction = radius > 0.0
+    cos = where(has_direction, half / where(has_direction, radius, 1.0), 1.0)
+    along_x, along_y = np.sqrt(0.5 * (1.0 + cos)), np.sqrt(0.5 * (1.0 - cos))
+    return Vector(along_x, where(xy < 0.0, -along_y, along_y))
+
+
+def _squared_extent(r: Vector, normal: Vector) -> Number:
+    """Return the squared length of a bond across a crack, at least LEAST times |r|²."""
+    across, least = r.x * normal.x + r.y * normal.y, LEAST * squared_length(r)
+    squared: Number = where(across * across > least, across * across, least)
+    return squared
+
+
+def _strain(stress: CellStress, r: Vector, normal: Vector, c: Constants) -> Number:
+    """Return κ, the strain of a bond across a crack with the normal e: (ε - ε_t (n · t)²) / (n ·
+    e)² + ε_σ - ε_e.
+
+    Here ε is the strain of the bond, ε_e and ε_t are the mean strains of the cell across and along
+    the crack, and ε_σ is its mean stress across the crack over Young's modulus. If the cell has no
+    strain but ε_e and ε_t, κ is ε_σ. For bonds at more than 60° to e, κ is reduced by (n · e)² /
+    LEAST.
+    """
+    x, y = normal.x, normal.y
+    xx, yy, xy = x * x, y * y, 2.0 * x * y
+    across, along = r.x * x + r.y * y, r.y * x - r.x * y
+    stress_across = stress.xx * xx + stress.yy * yy + stress.xy * xy
+    strain_across = stress.strain_xx * xx + stress.strain_yy * yy + stress.strain_xy * xy
+    strain_along = stress.strain_xx * yy + stress.strain_yy * xx - stress.strain_xy * xy
+    contraction = stress_across * _along(normal, c.along_y, c.across) - strain_across
+    own = stress.strain * squared_length(r) - strain_along * (along * along)
+    strain: Number = (own + contraction * (across * across)) / _squared_extent(r, normal)
+    return strain
 
 
 def _damage(strain: Any, onset: Any, failure: Any, damage: Any, p: Any) -> Any:
@@ -788,30 +837,10 @@ def _damage(strain: Any, onset: Any, failure: Any, damage: Any, p: Any) -> Any:
     return where(softens & (law > damage), law, damage)
 
 
-def _principal(stress: CellStress) -> tuple[Number, Number, Number]:
-    """Return the largest principal stress, and cosine and sine of twice the angle of its
-    direction."""
-    mean, half = 0.5 * (stress.xx + stress.yy), 0.5 * (stress.xx - stress.yy)
-    radius = np.sqrt(half * half + stress.xy * stress.xy)
-    has_direction = radius > 0.0
-    size = where(has_direction, radius, 1.0)
-    return (
-        mean + radius,
-        where(has_direction, half / size, 1.0),
-        where(has_direction, stress.xy / size, 0.0),
-    )
-
-
-def _projection(r: Any, cos: Any, sin: Any) -> Any:
-    """Return (r · e)² for the direction e, given by cosine and sine of twice its angle."""
-    x, y = r.x * r.x, r.y * r.y
-    return 0.5 * (x + y + cos * (x - y)) + sin * r.x * r.y
-
-
-def _along(cos: Number, sin: Number, along_y: Number, across: Number) -> Number:
+def _along(direction: Any, along_y: Any, across: Any) -> Any:
     """Return a compliance or stiffness along a direction, divided by that along x."""
-    x, y = 0.5 * (1.0 + cos), 0.5 * (1.0 - cos)
-    return x * x + along_y * y * y + across * 0.25 * sin * sin
+    x, y = direction.x * direction.x, direction.y * direction.y
+    return x * x + along_y * y * y + across * x * y
 
 
 def _material(rule: Calibrated) -> tuple[float, tuple[float, float, float, float]]:
@@ -849,6 +878,8 @@ def _pair(name: str, text: str) -> tuple[Remembered, Remembered]:
 
 _NUMBERS = (
     *_pair("damage", "damage of the bond, from 0 to 1 where it is broken, in the cell"),
-    *_pair("failure", "strain at which a crack tears the cell, negative along the bond,"),
+    *_pair("normal_x", "component x of the normal of the crack in the cell"),
+    *_pair("normal_y", "component y of the normal of the crack in the cell"),
 )
-"""Declarations of the damage and the failure strain of a bond in the cells on both sides."""
+"""Declarations of the damage of a bond, and of the normal of the crack, in the cells on both
+sides."""

@@ -646,7 +646,7 @@ def follow(
             reached, error_bound = branch.advance(state, _target(scene, moment), end)
         except UnconvergedError as error:
             part /= 2.0
-            if part >= SMALLEST_PART and not isinstance(error, SplitError):
+            if part >= SMALLEST_PART:
                 continue
             if branch.softness(state) < SEPARATED:
                 raise SeparatedError(_parted(scene, state, since)) from None

@@ -307,15 +307,16 @@ class DamagingCells:
             damage = self._damage_of(self._numbers, self._intact)
             return [np.broadcast_to(d, u.shape[:2]) for d in damage]
         points = [Vector(*np.moveaxis(u[:, :, k], -1, 0)) for k in range(u.shape[2])]
-        stress = self._stress(points)
-        numbers = []
+        gradient, numbers = self._gradient(points), []
         for n, (j, k, bond) in enumerate(shape.bonds):
-            cells: tuple[CellStress, ...] = ()
-            if stress is not None:
-                nothing = stress._replace(share=0.0)
-                cells = (stress if bond.on_left else nothing, stress if bond.on_right else nothing)
+            d, cells = points[k] - points[j], tuple[CellStress, ...]()
+            if self._cells:
+                rest = bond.slot.rest
+                here = CellStress(*self._cells.stress(*gradient, self._ratios, d, rest, 1.0))
+                nothing = here._replace(share=0.0)
+                cells = (here if bond.on_left else nothing, here if bond.on_right else nothing)
             own = [np.broadcast_to(value, u.shape[:2]) for value in self._numbers[n]]
-            limits, d = self._limits[n], points[k] - points[j]
+            limits = self._limits[n]
             with np.errstate(all="ignore"):
                 new = iter(self._evaluator.update(d, bond.slot.rest, limits, own, cells))
             numbers.append(
@@ -337,20 +338,16 @@ class DamagingCells:
             damage.append(np.where(intact[n], lost, 1.0))
         return damage
 
-    def _stress(self, points: list[Vector]) -> CellStress | None:
-        """Return the stress of the cells without damage; None if the model does not use it."""
-        if self._cells is None:
-            return None
+    def _gradient(self, points: list[Vector]) -> list[Any]:
+        """Return the components xx, xy, yx and yy of the mean gradient of the displacement."""
         d = [point - points[0] for point in points[1:]]
-        gradient = [
+        return [
             sum_in_order(
                 [getattr(x, a) * getattr(g, b) for x, g in zip(d, self._shape.rates, strict=True)]
             )
             for a in "xy"
             for b in "xy"
         ]
-        xx, yy, xy = self._cells.stress(*gradient, self._ratios)
-        return CellStress(xx, yy, xy, 1.0)
 
     @cached_property
     def _ratios(self) -> Any:

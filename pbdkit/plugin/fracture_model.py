@@ -281,15 +281,24 @@ class CellStress(NamedTuple):
     Parameters
     ----------
     xx, yy, xy : Number
-        Components σ_xx, σ_yy and σ_xy.
+        Components σ_xx, σ_yy and σ_xy of the mean stress.
     share : Number
         Area fraction of the cell inside the body, 0 to 1; 0 if there is no cell.
+    strain_xx, strain_yy, strain_xy : Number
+        Components ε_xx, ε_yy and ε_xy of the mean strain.
+    strain : Number
+        Strain of the bond. It differs from the mean strain of the cell along the bond at the edges
+        of rectangles.
     """
 
     xx: Number
     yy: Number
     xy: Number
     share: Number
+    strain_xx: Number
+    strain_yy: Number
+    strain_xy: Number
+    strain: Number
 
 
 class SoftensCells(RenewsBonds):
@@ -330,16 +339,19 @@ class SoftensCells(RenewsBonds):
 
     @staticmethod
     @abstractmethod
-    def load(stress: CellStress, c: Constants, p: Parameters) -> Number:
-        """Return the stress of a cell divided by that at which it begins to soften, elementwise.
+    def load(stress: CellStress, r: Vector, c: Constants, p: Parameters) -> Number:
+        """Return the stress at a bond in a cell divided by that at which it begins to soften,
+        elementwise.
 
-        If several cells have reached their limit, the solver `equilibrium` softens the one with the
+        If several bonds have reached their limit, the solver `equilibrium` softens the one with the
         largest value first.
 
         Parameters
         ----------
         stress : CellStress
             Stress of the cell.
+        r : Vector
+            Rest offset X_k - X_j of the bond, in lattice units.
         c : Constants
             Constants of the slot and state variables of the bond.
         p : Parameters

@@ -147,8 +147,10 @@ class Fracturing:
             with np.errstate(all="ignore"), errors_attributed_to(self._model, when):
                 limits = self._constants.limits_at(slot, n, block)
                 cells = self._cells.of(m, slot, block) if self._cells else ()
+                beside = self._cells.places(slot, block) if self._cells else ()
                 self._evaluator.renew_bonds(d, r, limits, numbers, intact, cells)
-            yield UpdatedBonds((n, *block.slices()[1:]), d, r, limits, numbers, intact, cells)
+            owner = (n, *block.slices()[1:])
+            yield UpdatedBonds(owner, d, r, limits, numbers, intact, cells, beside)
 
     def _breaks(self, part: UpdatedBonds, when: str) -> NDArray[np.bool_]:
         """Return which bonds break."""
@@ -161,41 +163,48 @@ class Fracturing:
         """Restore the state variables of cells that would begin to soften, except the cells with
         the largest load. As long as the damage of cells that already soften still changes, restore
         the state variables of all cells that would begin. Return whether all of them wait."""
-        change, largest = 0.0, 0.0
+        assert self._cells
         sides = [[name.endswith(side) for name in self._numbers] for side in ("_left", "_right")]
-        waiting = []
+        loads = np.zeros(len(self._cells.shares))
+        softens, values = np.zeros(len(loads), np.bool_), []
         for part in parts:
             for n, numbers in enumerate(sides):
                 old = [
                     value[part.owner] for value, its in zip(previous, numbers, strict=True) if its
                 ]
                 new = [value for value, its in zip(part.numbers, numbers, strict=True) if its]
-                begins = np.all([value == 0.0 for value in old], axis=0)
-                ratios = (
-                    abs(b - a) / np.maximum(1.0, abs(a)) for a, b in zip(old, new, strict=True)
-                )
-                change = max(change, *(float(ratio[~begins].max(initial=0.0)) for ratio in ratios))
-                begins &= np.any([value != 0.0 for value in new], axis=0)
-                if begins.any():
-                    load = self._load(part, n)
-                    largest = max(largest, float(load[begins].max()))
-                    waiting.append((begins, load, old, new))
-        threshold = largest * (1.0 - TIE_RTOL) if change <= MAX_DAMAGE_CHANGE else math.inf
-        for begins, load, old, new in waiting:
+                cell, is_intact = part.beside[n], np.all([value == 0.0 for value in old], axis=0)
+                softens[cell[~is_intact]] = True
+                values.append((part, n, cell, is_intact, old, new))
+        change, waiting = 0.0, []
+        for part, n, cell, is_intact, old, new in values:
+            waits = is_intact & ~softens[cell]
+            ratios = (abs(b - a) / np.maximum(1.0, abs(a)) for a, b in zip(old, new, strict=True))
+            change = max(change, *(float(ratio[~waits].max(initial=0.0)) for ratio in ratios))
+            waits &= np.any([value != 0.0 for value in new], axis=0)
+            if waits.any():
+                np.maximum.at(loads, cell[waits], self._load(part, n)[waits])
+                waiting.append((cell, waits, old, new))
+        threshold = float(loads.max(initial=0.0)) * (1.0 - TIE_RTOL)
+        threshold = threshold if change <= MAX_DAMAGE_CHANGE else math.inf
+        for cell, waits, old, new in waiting:
             for a, b in zip(old, new, strict=True):
-                np.copyto(b, a, where=begins & (load < threshold))
+                np.copyto(b, a, where=waits & (loads[cell] < threshold))
         return bool(waiting) and threshold == math.inf
 
     def _load(self, part: UpdatedBonds, side: int) -> NDArray[Any]:
-        """Return the load of the cells on one side of bonds. If there is no cell on that side, at
-        the edge of the body, return the load of the cell on the other side."""
-        loads = [self._evaluator.load(cell, part.limits, part.numbers) for cell in part.cells]
+        """Return the load of bonds in the cells on one side. If there is no cell on that side, at
+        the edge of the body, return the load in the cell on the other side."""
+        loads = [
+            self._evaluator.load(cell, part.r, part.limits, part.numbers) for cell in part.cells
+        ]
         load: NDArray[Any] = np.where(part.cells[side].share > 0.0, loads[side], loads[1 - side])
         return np.broadcast_to(load, part.intact.shape)
 
 
 class UpdatedBonds(NamedTuple):
-    """Bonds along a slot with updated state variables."""
+    """Bonds along a slot with updated state variables. `beside` are the places of the cells on both
+    sides in the flat array of cells, for a model that softens cells."""
 
     owner: Owner
     d: Vector
@@ -204,6 +213,7 @@ class UpdatedBonds(NamedTuple):
     numbers: list[NDArray[Any]]
     intact: NDArray[np.bool_]
     cells: tuple[CellStress, ...]
+    beside: tuple[NDArray[np.intp], ...]
 
 
 BREAKS_AT_REST = Hindrance("an equilibrium with breaking bonds", "fracture")

@@ -3,6 +3,7 @@ stress."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 from operator import add
@@ -11,10 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbdkit.lattice.raster import Block
+from pbdkit.lattice.raster import Block, slot_step
 from pbdkit.plugin import CellStress, Slot, SoftensCells, Stiffness, Vector
 from pbdkit.plugin.lattice import CellPolygon, Index, Side, signed_area
 from pbdkit.plugin.rule import material_of
+from pbdkit.plugin.vector import vector
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.state import shown
 
@@ -56,6 +58,12 @@ class CellBeside:
         for size, cells in zip(shape[1:], corner[1], strict=True):
             step = step * size + cells
         return step
+
+    def step(self, shape: tuple[int, ...]) -> int:
+        """Return the offset from the start of a bond, in flat arrays of particles, to the cell in
+        flat arrays of cells."""
+        first = self.side.first
+        return self.side.kind * math.prod(shape) + (slot_step(shape, first) if first else 0)
 
     @staticmethod
     def _at(corner: tuple[int, Index], owner: Block) -> Block:
@@ -117,7 +125,7 @@ class CellStresses:
 
     @property
     def stress(self) -> Any:
-        """The function that computes the stress from a gradient and the ratios."""
+        """The function that computes the values of a `CellStress`."""
         return linear_stress if self._scene.experiment.rule.linear else turned_stress
 
     def beside(self, slot: Slot) -> tuple[CellBeside, CellBeside]:
@@ -139,15 +147,31 @@ class CellStresses:
         if self._cells.mixed:
             parts = (self._cells.beside(slot, owner, precision, p) for p in self.ratios_by_cell)
             ratios = [Stiffness(*side) for side in zip(*parts, strict=True)]
+        d, r = vector(owner.seen_through(slot).of(u) - owner.of(u)), slot.rest
         first, second = (
-            self._stressed(cell.gradient(u, owner), c, share)
+            self._stressed(cell.gradient(u, owner), c, d, r, share)
             for cell, c, share in zip(self.beside(slot), ratios, shares, strict=True)
         )
         return first, second
 
-    def _stressed(self, gradient: list[Any], ratios: Stiffness, share: Any) -> CellStress:
-        xx, yy, xy = self.stress(*gradient, ratios)
-        return CellStress(xx, yy, xy, share)
+    @cached_property
+    def shares(self) -> NDArray[Any]:
+        """Area fractions of all cells inside the body, in a flat array."""
+        assert self._cells.share is not None
+        return self._cells.share.ravel()
+
+    def places(self, slot: Slot, owner: Block) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return the places in the flat array of cells of the cells to the left and to the right of
+        bonds. If there is a cell on one side only, both are its place."""
+        shape, share = self._scene.raster.shape, self.shares
+        place = np.arange(math.prod(shape)).reshape(shape)[owner.slices()]
+        left, right = (place + cell.step(shape) for cell in self.beside(slot))
+        return np.where(share[left] > 0.0, left, right), np.where(share[right] > 0.0, right, left)
+
+    def _stressed(
+        self, gradient: list[Any], ratios: Stiffness, d: Vector, r: Vector, share: Any
+    ) -> CellStress:
+        return CellStress(*self.stress(*gradient, ratios, d, r, share))
 
 
 def _beside(scene: Scene, slot: Slot, side: Side) -> CellBeside:
@@ -171,27 +195,41 @@ def rates_of(polygon: CellPolygon) -> tuple[Vector, ...]:
     )
 
 
-def linear_stress(xx: Any, xy: Any, yx: Any, yy: Any, c: Any) -> Any:
-    """Return the stress under a small gradient of the displacement."""
-    return _elastic(xx, yy, xy + yx, c)
+def linear_stress(
+    xx: Any, xy: Any, yx: Any, yy: Any, c: Any, d: Any, r: Any, share: Any
+) -> tuple[Any, ...]:
+    """Return the values of a `CellStress` under a small gradient of the displacement, for a bond d,
+    r of the cell."""
+    return _elastic(xx, yy, xy + yx, r.x * d.x + r.y * d.y, c, r, share)
 
 
-def turned_stress(xx: Any, xy: Any, yx: Any, yy: Any, c: Any) -> Any:
-    """Return the stress of the Green–Lagrange strain, which excludes rotations."""
+def turned_stress(
+    xx: Any, xy: Any, yx: Any, yy: Any, c: Any, d: Any, r: Any, share: Any
+) -> tuple[Any, ...]:
+    """Return the same as `linear_stress` for the Green–Lagrange strain, which excludes
+    rotations."""
     along_x, along_y = xx + 0.5 * (xx * xx + yx * yx), yy + 0.5 * (xy * xy + yy * yy)
-    return _elastic(along_x, along_y, xy + yx + (xx * xy + yx * yy), c)
+    along = r.x * d.x + r.y * d.y + 0.5 * (d.x * d.x + d.y * d.y)
+    return _elastic(along_x, along_y, xy + yx + (xx * xy + yx * yy), along, c, r, share)
 
 
-def _elastic(xx: Any, yy: Any, shear: Any, c: Any) -> Any:
+def _elastic(
+    xx: Any, yy: Any, shear: Any, along: Any, c: Any, r: Any, share: Any
+) -> tuple[Any, ...]:
     return (
         c.xx * xx + c.xy * yy + c.x_shear * shear,
         c.xy * xx + c.yy * yy + c.y_shear * shear,
         c.x_shear * xx + c.y_shear * yy + c.shear * shear,
+        share,
+        xx,
+        yy,
+        0.5 * shear,
+        along / (r.x * r.x + r.y * r.y),
     )
 
 
 def tried(model: object, ones: Any) -> tuple[CellStress, ...]:
     """Return the cells with which a model's functions are tested, as many as the functions
     receive."""
-    stress = CellStress(ones, 0.5 * ones, 0.25 * ones, ones)
+    stress = CellStress(*np.multiply.outer([1.0, 0.5, 0.25, 1.0, 0.9, 0.4, 0.2, 0.7], ones))
     return (stress, stress) if isinstance(model, SoftensCells) else ()

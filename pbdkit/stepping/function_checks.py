@@ -28,7 +28,6 @@ from pbdkit.lattice.raster import FOLLOWER, Places
 from pbdkit.plugin import (
     BreaksAtStrain,
     Calibrated,
-    CellStress,
     Component,
     FollowerRule,
     FractureModel,
@@ -36,7 +35,6 @@ from pbdkit.plugin import (
     RenewsParticles,
     Slot,
     Softens,
-    SoftensCells,
     Vector,
 )
 from pbdkit.plugin.component import as_vector
@@ -44,6 +42,7 @@ from pbdkit.plugin.discovery import errors_attributed_to, full_description
 from pbdkit.plugin.rule import material_of
 from pbdkit.plugin.vector import length
 from pbdkit.scene.scene import Scene
+from pbdkit.stepping.cell_stress import tried
 from pbdkit.stepping.rule_evaluation import Evaluator, Surroundings, summed
 from pbdkit.stepping.state import State, shown
 
@@ -218,8 +217,7 @@ def _bond_answers(
     limits, r = scene.constants.limits_at(slot, plane, owner), slot.rest
     d = Vector(*(strains * component for component in r))
     u = Vector(*(0.1 * strains + component for component in r))
-    stress = CellStress(strains, 0.5 * strains, 0.1 * strains, np.ones_like(strains))
-    cells = (stress, stress) if isinstance(model, SoftensCells) else ()
+    cells = tuple(c._replace(share=np.ones_like(strains)) for c in tried(model, strains))
     lost = Vector(*(np.zeros_like(strains) for _ in r))
     _frozen((d, u, lost, tuple(limits), *map(tuple, cells)))
     everywhere, p = np.ones(strains.shape, bool), scene.constants.fracture

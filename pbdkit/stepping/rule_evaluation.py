@@ -222,10 +222,11 @@ class Evaluator:
         c = self._scene.constants.of_bond(*limits, *shown(own))
         return as_values(self._model.update(d, r, c, self._q, *cells), "update")
 
-    def load(self, cell: CellStress, limits: Any, own: Sequence[Any]) -> Any:
-        """Return the ratio of the stress of a cell to that at which it softens."""
+    def load(self, cell: CellStress, r: Vector, limits: Any, own: Sequence[Any]) -> Any:
+        """Return the ratio of the stress at a bond in a cell to that at which it softens."""
         assert isinstance(self._model, SoftensCells)
-        return self._model.load(cell, self._scene.constants.of_bond(*limits, *shown(own)), self._q)
+        c = self._scene.constants.of_bond(*limits, *shown(own))
+        return self._model.load(cell, r, c, self._q)
 
     def breaks(self, d: Vector, r: Vector, limits: Any, own: Sequence[Any]) -> Any:
         """Return whether bonds with the given state variables break."""

@@ -147,7 +147,11 @@ def stressed(model: Component, seed: int) -> tuple[Any, ...]:
     """
     rng, count = np.random.default_rng(seed), 2 * isinstance(model, SoftensCells)
     return tuple(
-        (*rng.uniform(-0.2, 0.5, (3, *SHAPE)), rng.integers(0, 2, SHAPE).astype(float))
+        (
+            *rng.uniform(-0.2, 0.5, (3, *SHAPE)),
+            rng.integers(0, 2, SHAPE).astype(float),
+            *rng.uniform(-0.2, 0.5, (4, *SHAPE)),
+        )
         for _ in range(count)
     )
 

@@ -51,6 +51,12 @@ BAR = {
     "steps": 20,
     "diagnostics": REACTIONS,
 }
+STRAIGHT = {
+    "select": {"nearest": [[float(x), y] for x in range(1, int(LENGTH)) for y in (0.0, 1.0)]},
+    "axes": ["y"],
+    "motion": {"type": "hold"},
+}
+"""A bar that is not held straight can bend where it softens, so that the branch splits."""
 NOTCHED = BAR | {
     "body": {"type": "rectangle", "width": 12.0, "height": 6.0},
     "rule": {"type": "elastic", "poisson_ratio": 0.2},
@@ -97,7 +103,7 @@ def notched():
 
 @pytest.mark.parametrize("control", [CELL, DISSIPATED], ids=["opening", "dissipation"])
 def test_snap_back_of_a_bar_is_that_of_springs_in_series(control):
-    ds = ran(BAR, control)
+    ds = ran(BAR, control, leaders=[HELD, PULLED, STRAIGHT])
     u = (ds.position - ds.reference).sel(axis="x").values
     at = {x: np.isclose(ds.reference.values[:, 0], x) for x in (15.0, 16.0, LENGTH)}
     opening, end = u[:, at[16.0]].mean(1) - u[:, at[15.0]].mean(1), u[:, at[LENGTH]].mean(1)
@@ -158,7 +164,7 @@ def test_work_of_the_load_is_stored_or_dissipated(notched):
     lost = external_work(force, moved) - notched.strain_energy.values
     np.testing.assert_allclose(notched.dissipated_energy, lost, atol=1e-10 * lost[-1])
     assert (np.diff(lost) > -1e-12).all()
-    assert lost[-1] > 9e-6
+    assert lost[-1] > 8e-6
 
 
 def test_order_of_the_points_turns_a_sign(notched):
@@ -281,7 +287,7 @@ def test_branches_that_split_are_refused():
     ds = ended(BAR, {"type": "dissipation", "to": ENERGY}, **uniform)
     assert ds.status == "unconverged"
     assert re.search(
-        r"ends between step 1 and step 2, at the load factor 3.*: the tangent stiffness has "
+        r"ends between step 1 and step 1\.\d+, at the load factor 3.*: the tangent stiffness has "
         r"\d+ negative eigenvalues: the branch splits into several, .*; make one place weaker",
         ds.stop_reason,
     )
@@ -293,14 +299,21 @@ def test_branches_that_split_are_refused():
 
 def test_branch_ends_when_the_body_has_come_apart_or_the_opening_decreases():
     pulled = {"loads": [], "leaders": [HELD, PULLED], "diagnostics": REACTIONS}
-    tough = {"fracture": NOTCHED["fracture"] | {"energy": 2e-5}}
-    ds = ended(NOTCHED, MOUTH | {"to": 0.05}, steps=10, **pulled, **tough)
+    tough = {
+        "body": {"type": "rectangle", "width": 6.0, "height": 6.0},
+        "rule": {"type": "elastic", "poisson_ratio": 0.0},
+        "fracture": NOTCHED["fracture"] | {"energy": 2e-5, "cracks": [[[2.5, -1.0], [2.5, 2.5]]]},
+    }
+    mouth = MOUTH | {"between": [[2, 0], [3, 0]], "to": 0.05}
+    ds = ended(NOTCHED, mouth, steps=10, **pulled, **tough)
     assert ds.status == "separated"
     end = ds.stop_reason.removeprefix("the body has come apart after step ")
     assert re.match(r"\d+(\.\d+)?, at the load factor [\d.]+ and the opening [\d.]+ of 0.05 ", end)
     to = float(re.search(r"records up to there .* set solver.control.to to ([\d.]+) ", end)[1])
+    assert to == pytest.approx(2.0 * 2e-5 / ONSET, rel=0.01)
     assert float(ds.opening[-1]) <= to < float(ds.opening[-1]) + 0.05 / 10
-    ds = ended(NOTCHED, MOUTH, steps=10, **pulled)
+    ends = CELL | {"between": [[0, 0], [LENGTH, 0]], "to": 0.06}
+    ds = ended(BAR, ends, leaders=[HELD, PULLED, STRAIGHT])
     assert ds.status == "unconverged"
     assert "the controlled quantity has its largest value on the branch" in ds.stop_reason
 

@@ -44,7 +44,9 @@ EDGE, DIAGONAL = 0.75, 0.375
 """Stiffnesses of bonds over Young's modulus and thickness."""
 POISSON = 1 / 3
 ONSET, ENOUGH, MOST = 1e-4, 1e-5, 3000
-NUMBERS = "damage_left", "damage_right", "failure_left", "failure_right"
+NUMBERS = tuple(
+    f"{name}_{side}" for name in ("damage", "normal_x", "normal_y") for side in ("left", "right")
+)
 """State variables of a bond of `Cohesive`, in their order."""
 
 
@@ -126,27 +128,32 @@ class Half:
         """Yield the force and the damage of the cells at each opening, with equilibrium and
         softening in turn, for the requested openings; some bonds are `cut`."""
         (c, p), zero = constants(self.h, fracture), np.zeros(self.columns - 1)
-        numbers = dict.fromkeys(NUMBERS, zero)
-        d = r = Vector(zero, zero + self.h)
+        upright, diagonal = Vector(zero, zero + self.h), Vector(zero + self.h, zero + self.h)
+        bonds = {"left": upright, "right": upright, "diagonal": diagonal}
+        numbers = {bond: dict.fromkeys(NUMBERS, zero) for bond in bonds}
         for opening in openings:
             for _ in range(MOST):
-                damage = numbers["damage_left"]
-                force, x = self.force(np.maximum(cut, self.lost(damage)), opening)
-                strain = (x[self.columns + 1 :] + x[self.columns : -1]) / self.h
+                damage = {bond: numbers[bond]["damage_left"] for bond in bonds}
+                force, x = self.force(np.maximum(cut, self.lost(**damage)), opening)
+                strains = 2 * x[self.columns :] / self.h
+                strain = (strains[1:] + strains[:-1]) / 2
                 along = np.diff(x[: self.columns]) / self.h
                 pull = (strain + POISSON * along) / (1 - POISSON**2)
-                stress = CellStress(zero, pull, zero, zero + 1.0)
-                known = SimpleNamespace(**numbers, **c)
-                found = Cohesive.update(d, r, known, p, stress, stress)
-                numbers = dict(zip(NUMBERS, found, strict=True))
-                if (numbers["damage_left"] - damage).max() < ENOUGH:
+                own = {"left": strains[:-1], "right": strains[1:], "diagonal": (along + strain) / 2}
+                for bond, r in bonds.items():
+                    mean = along, strain, zero
+                    stress = CellStress(zero, pull, zero, zero + 1.0, *mean, own[bond])
+                    known = SimpleNamespace(**numbers[bond], **c)
+                    found = Cohesive.update(r, r, known, p, stress, stress)
+                    numbers[bond] = dict(zip(NUMBERS, found, strict=True))
+                if all((numbers[n]["damage_left"] - damage[n]).max() < ENOUGH for n in bonds):
                     break
             yield force, damage
 
-    def lost(self, damage):
-        """The shares of their pull that bonds lose by the damage of the cells beside them."""
-        beside = np.concatenate([damage[:1], (damage[1:] + damage[:-1]) / 2, damage[-1:]])
-        return np.concatenate([beside, damage])
+    def lost(self, left, right, diagonal):
+        """The shares of their pull that bonds lose by the damage in the cells beside them."""
+        beside = np.concatenate([left[:1], (left[1:] + right[:-1]) / 2, right[-1:]])
+        return np.concatenate([beside, diagonal])
 
 
 def constants(h, fracture):

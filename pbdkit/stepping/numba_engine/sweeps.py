@@ -190,7 +190,7 @@ def marking_lines(plan: Plan, owner: str, there: str) -> list[str]:
 
 
 def stress_lines(plan: Plan, owner: str) -> list[str]:
-    """Return lines that compute the stress of the cells to the `left` and `right` of a bond of
+    """Return lines that compute the stress of the cells to the `left` and `right` of a bond d, r of
     plane n. `owner` is the flat place of the end at which the bond is stored."""
     corners = len(plan.scene.neighbourhood.tiling.polygons[0].corners)
     count = len(Stiffness._fields)
@@ -210,8 +210,8 @@ def stress_lines(plan: Plan, owner: str) -> list[str]:
                 terms = (f"e{k}_{a} * {rate}" for k, rate in rates)
                 lines.append(f"g_{a}{axis} = {' + '.join(terms)}")
         ratios = f"Stiffness({', '.join(ratio_names)})"
-        lines.append(f"xx, yy, xy = stress(g_xx, g_xy, g_yx, g_yy, {ratios})")
-        lines.append(f"{name} = CellStress(xx, yy, xy, flat_body[cell])")
+        more = f"{ratios}, d, r, flat_body[cell]"
+        lines.append(f"{name} = CellStress(*stress(g_xx, g_xy, g_yx, g_yy, {more}))")
     return lines
 
 
@@ -233,13 +233,7 @@ def stress_arrays(scene: Scene, real: np.dtype[Any]) -> dict[str, NDArray[Any]]:
             ]
         )
         rates.append([cell.rates for cell in cells])
-        shares.append(
-            [
-                cell.side.kind * math.prod(shape)
-                + (slot_step(shape, cell.side.first) if cell.side.first else 0)
-                for cell in cells
-            ]
-        )
+        shares.append([cell.step(shape) for cell in cells])
     return {
         "corner_steps": np.array(steps, np.int64),
         "corner_rates": np.array(rates, real),
