@@ -112,7 +112,7 @@ def test_verify_prints_one_line_per_file(sound, call, tmp_path):
     with xarray.open_dataset(sound, engine="netcdf4", decode_times=False) as plain:
         plain.to_netcdf(bare)
     assert call("verify", str(good)).code == 0
-    result = call("verify", *map(str, (good, bad, bare, tmp_path / "none.nc")))
+    result = call("verify", *map(str, (good, bad, bare, tmp_path / "missing.nc")))
     assert result.code == 6
     assert result.out.splitlines() == [
         f"{good}: unchanged since it was written",
@@ -121,7 +121,7 @@ def test_verify_prints_one_line_per_file(sound, call, tmp_path):
             "written"
         ),
         f"{bare}: has no seal: changes since it was written cannot be detected",
-        f"{tmp_path / 'none.nc'}: there is no such file",
+        f"{tmp_path / 'missing.nc'}: there is no such file",
     ]
 
 

@@ -205,7 +205,8 @@ MISTAKES = {
     Array: ("Diagnostic 'array' failed at step 0: `measure` returned ndarray", TUPLE),
     Alone: ("Diagnostic 'alone' failed", "`variables` returned Variable", TUPLE),
     Misspelt: ("no attribute 'displacment'; did you mean 'displacement'?", "evaluation.py, line "),
-    Infinite: ("q of particle 1 at step 0", "finite, but a recorded variable is not"),
+    Infinite: ("Diagnostic 'infinite' failed at step 0: `measure` returned inf as 'q' of",
+               "declare the variable with `may_be_nan=True`"),
 }  # fmt: skip
 
 
