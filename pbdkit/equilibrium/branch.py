@@ -703,8 +703,8 @@ def _where(
             "controlled quantity has its largest value on the branch, or the branch splits"
         )
     remedy = (
-        "make one place weaker (a region, a notch, a random field) or the load asymmetric, or "
-        "control the opening of the crack"
+        "make one place weaker (a region, a notch, a random field) or the load asymmetric, hold a "
+        "body that can bend or slide at the crack, or control the opening of the crack"
         if isinstance(error, SplitError)
         else "use more steps, a control that grows on the branch (another pair of points, or the "
         "dissipated energy), or a finer lattice"
