@@ -567,9 +567,9 @@ class Cohesive(UsesStiffness, SoftensCells, Parting):
     is the strength.
 
     The opening is the cracking strain times the length of the bond across the crack, |r · e|, as in
-    a crack band (Bažant and Oh 1983, Oliver 1989) whose width is that of each bond. The failure
-    strain follows from the energy if the band does not contract along the crack. A bond is broken
-    when D = 1 in both cells beside it. Cracks do not close under compression.
+    a crack band (Bažant and Oh 1983, Oliver 1989) with the width of each bond. The failure strain
+    follows from the energy if the band does not contract along the crack. A bond is broken when D =
+    1 in both cells beside it. Cracks do not close under compression.
     """
 
     other_names: ClassVar[Mapping[str, str]] = {"strength": "onset"}

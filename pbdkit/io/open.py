@@ -107,8 +107,9 @@ def refuse_no_file(file: Path) -> None:
     if not file.is_file():
         what = "is not a plain file, and not a result of pbdkit"
         if not file.exists():
-            beside = sorted(path.name for path in file.parent.glob("*.nc"))
-            what = f"there is no such file{did_you_mean(file.name, beside)}"
+            beside = sorted(path.stem for path in file.parent.glob("*.nc"))
+            hint = did_you_mean(file.stem, beside).replace("'?", ".nc'?")
+            what = f"there is no such file{hint}"
         raise StorageError(f"{file}: {what}")
 
 

@@ -340,7 +340,7 @@ def test_bond_breaks_if_its_damage_is_complete_in_both_cells():
 
 
 def test_bonds_of_a_bent_cell_soften_by_their_own_openings():
-    """A cell whose crack opens at its left edge only: the edge breaks, the diagonals have half of
+    """The crack of a cell opens at its left edge only: the edge breaks, the diagonals have half of
     its opening, and the right edge remains intact."""
     given = Strained(rule=ELASTIC, body={"type": "grid", "columns": 2, "rows": 2})
     opening = 1.25 * 2.0 * ENERGY / ONSET
