@@ -41,7 +41,7 @@ from pbdkit.testing.mechanics import (
     stiffening,
     work_and_energy,
 )
-from pbdkit.testing.states import advanced, displacements
+from pbdkit.testing.states import DivergenceError, advanced, displacements
 from pbdkit.testing.subject import NotApplicableError, PropertyError, Subject, place_of, property_of
 
 STEPS = 3
@@ -76,7 +76,12 @@ def goes_alike_in_all_units(subject: Subject) -> None:
         if np.abs(advanced(scene, 0.0 * u, 1)).max() > 0.0:
             continue  # The property `rests` reports it.
         larger = _scaled_scene(scene.experiment)
-        original, scaled = advanced(scene, u, STEPS)[-1], advanced(larger, LARGER * u, STEPS)[-1]
+        original = advanced(scene, u, STEPS)[-1]
+        try:
+            scaled = advanced(larger, LARGER * u, STEPS)[-1]
+        except DivergenceError:
+            fault = f"with all lengths {LARGER:g} times as large the displacements are not finite"
+            raise PropertyError(f"{fault}: {REMEDY}") from None
         deviation = np.abs(scaled / LARGER - original).max() / max(1e-300, np.abs(original).max())
         if not deviation <= ROUNDING:
             fault = f"a body with all lengths {LARGER:g} times as large moves differently"

@@ -367,6 +367,20 @@ class HasAScale(Sound):
         return move / (1.0 + length(move))
 
 
+class Decays(Sound):
+    """Weights that decrease over a length, which is not annotated."""
+
+    type: Literal["decays"] = "decays"
+    decay_length: float = Field(1.0, description="Length over which weights decrease.")
+
+    def weights(self, slot, setting):
+        return {"share": float(np.exp(-length(slot.rest) / self.decay_length))}
+
+    @staticmethod
+    def gather(d, r, w, p):
+        return w.share * d, w.share
+
+
 class LeansRight(Sound):
     """Counts neighbours to the right twice."""
 

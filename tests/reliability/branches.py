@@ -4,8 +4,8 @@ laws of mechanics. Exits with 1 if a figure exceeds its goal.
     python tests/reliability/branches.py
 
 A bar of 60 cells of which one softens, and that is held straight, is a series of springs: in 60
-steps it snaps back. A notched beam in three-point bending, 1617 particles and 60 steps, is followed by the opening of the mouth of
-its notch; its processor time includes the start of the program.
+steps it snaps back. A notched beam in three-point bending, 1617 particles and 60 steps, is followed
+by the opening of the mouth of its notch; its processor time includes the start of the program.
 """
 
 from __future__ import annotations

@@ -6,8 +6,8 @@ The beam is 16 cells high and has a notch of 7.5 cells; the process zone is 2.8 
 as the beam is high. The reference consists of quadratic elements (scikit-fem) with the same
 softening law between the two halves in the plane of the notch. For both, the deflection of the load
 grows in the same increments. Printed are the peak load over that of the reference, and the work
-of both over the fracture energy of the ligament. Exits with 1 if a peak
-differs by more than 5 % from that of the reference. The goal for the work, 3 %, is not met.
+of both over the fracture energy of the ligament. Exits with 1 if a peak differs by more than 5 %
+from that of the reference. The goal for the work, 3 %, is not met.
 """
 
 from __future__ import annotations

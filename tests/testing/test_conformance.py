@@ -86,6 +86,7 @@ FAULTS = [
         ("`force` with a load is not the value without load plus the"),
     ),
     (rules.HasAScale, "goes-alike-in-all-units", "annotate parameters that are lengths"),
+    (rules.Decays, "goes-alike-in-all-units", "are not finite: compare lengths"),
     (rules.LeansRight, "goes-alike-mirrored-and-turned", "or declare `has_axes`"),
     (
         rules.ResistsTurning,
