@@ -194,6 +194,15 @@ class Incomplete(ParticleOperation):
     type: Literal["incomplete"] = "incomplete"
 
 
+def test_coordinates_in_place_of_points():
+    with pytest.raises(pbdkit.ExperimentError) as caught:
+        pbdkit.load("start").with_settings({"leaders.0.select": {"nearest": ["0 mm", "4 mm"]}})
+    message = str(caught.value)
+    assert message.endswith(
+        "nearest: should be a list of points, got [0 mm, 4 mm]; write [[0 mm, 4 mm]]"
+    )
+
+
 NEW = "make new arrays, `x = x + 1` instead of `x += 1`"
 PLUGINS = {
     Writing: ("Diagnostic 'writing' failed at step 0", "read-only; " + NEW),

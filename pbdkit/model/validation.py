@@ -142,6 +142,7 @@ _LONG = re.compile(r"(?<=than )(?=[-\d.]{20})[-\d.]+|(?<=equal to )(?=[-\d.]{20}
 def report(error: ValidationError, source: Source) -> ExperimentError:
     """Convert a pydantic error to an ExperimentError with one line for each of the first faults."""
     details = [_as_written(_plainly(f), source) for f in error.errors(include_url=False)]
+    details = _as_points(details)
     faults = [f for f in details if not _follows(f, details)]
     lines = [source.message(*_described(fault)) for fault in faults[:MAX_FAULTS]]
     if len(faults) > MAX_FAULTS:
@@ -154,6 +155,27 @@ def _plainly(fault: Any) -> Any:
     where = tuple(word for word in fault["loc"] if word not in (*FORMS, "[key]"))
     message = {"msg": f"should be {WORD}"} if fault["loc"][-1:] == (WORD,) else {}
     return fault | {"loc": where} | message
+
+
+def _as_points(faults: list[Any]) -> list[Any]:
+    """Return the faults with one fault in place of two if the coordinates of one point are given
+    where a list of points is expected."""
+    points = list[Any]()
+    for fault in faults:
+        *parent, n = fault["loc"] or ("",)
+        both = [*points[-1:], fault]
+        if (
+            n == 1
+            and both[0]["loc"] == (*parent, 0)
+            and all(f["type"] == "tuple_type" for f in both)
+            and all(isinstance(f["input"], (str, int, float)) for f in both)
+        ):
+            point = ", ".join(str(f["input"]) for f in both)
+            message = f"should be a list of points, got [{point}]; write [[{point}]]"
+            points[-1] = {"loc": tuple(parent), "type": "", "ctx": {"text": message}}
+        else:
+            points.append(fault)
+    return points
 
 
 def _as_written(fault: Any, source: Source) -> Any:
@@ -268,7 +290,7 @@ def _follows(fault: Any, faults: list[Any]) -> bool:
     where = fault["loc"]
     if fault["type"] != "too_short":
         return bool(fault["type"] == "default_factory_not_called")
-    return any(f["loc"][: len(where)] == where and f["loc"] != where for f in faults)
+    return any(f["loc"][: len(where)] == where and f is not fault for f in faults)
 
 
 MAX_TYPE = 200
