@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -32,6 +33,9 @@ Errors of the prediction are larger for these parts.
 
 SECANT_STEP = 2e-2
 """Step of differences, as a fraction of the value, of predictions that are not smooth."""
+
+BRANCH = 3.0
+"""Ratio of the changes in both directions above which the larger one is another branch."""
 
 MIN_STEP = 1e-7
 """Smallest step as a fraction of the value, used near a bound."""
@@ -208,7 +212,8 @@ class Parameter:
         """Return the quotient of differences of a function that is not smooth.
 
         The parameter is changed by a fraction of its value in both directions, or in one of them if
-        there is no value in the other one.
+        there is no value in the other one. If the change in one direction is much larger than in
+        the other, the function has followed another branch there, and the smaller one is used.
 
         Parameters
         ----------
@@ -222,17 +227,18 @@ class Parameter:
         UnconvergedError
             If the function has no value at the experiment, or none in both directions.
         """
-        value, points = self.value_in(experiment), dict[float, Any]()
-        step = SECANT_STEP * (abs(value) or 1.0)
-        for end in (value + step, value - step):
-            try:
-                points[end] = function(self.put(experiment, end))
-            except (ExperimentError, UnconvergedError):
-                points[value] = function(experiment)
-        if len(points) < 2:
+        value, centre = self.value_in(experiment), function(experiment)
+        step, changes = SECANT_STEP * (abs(value) or 1.0), []
+        for signed in (step, -step):
+            with suppress(ExperimentError, UnconvergedError):
+                end = function(self.put(experiment, value + signed))
+                changes.append((end - centre) / signed)
+        if not changes:
             raise UnconvergedError(f"there is no prediction for {self.path} near {value:g}")
-        (first, above), (second, below) = points.items()
-        return (above - below) / (first - second)
+        changes.sort(key=lambda change: float(np.linalg.norm(change)))
+        first, last = changes[0], changes[-1]
+        is_branch = np.linalg.norm(last) > BRANCH * np.linalg.norm(first) > 0.0
+        return first if is_branch else (first + last) / 2.0
 
     def _ends(
         self, experiment: Experiment, value: float, fraction: float, pairs: int
