@@ -11,11 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbdkit.lattice.neighbourhood import bonds_in, plane_block
+from pbdkit.lattice.raster import Block
 from pbdkit.plugin import (
     BreaksAtStrain,
     CellStress,
     FractureModel,
     RenewsBonds,
+    Slot,
     SoftensCells,
     Vector,
     length,
@@ -147,10 +149,9 @@ class Fracturing:
             with np.errstate(all="ignore"), errors_attributed_to(self._model, when):
                 limits = self._constants.limits_at(slot, n, block)
                 cells = self._cells.of(m, slot, block) if self._cells else ()
-                beside = self._cells.places(slot, block) if self._cells else ()
                 self._evaluator.renew_bonds(d, r, limits, numbers, intact, cells)
             owner = (n, *block.slices()[1:])
-            yield UpdatedBonds(owner, d, r, limits, numbers, intact, cells, beside)
+            yield UpdatedBonds(owner, slot, block, d, limits, numbers, intact, cells)
 
     def _breaks(self, part: UpdatedBonds, when: str) -> NDArray[np.bool_]:
         """Return which bonds break."""
@@ -168,12 +169,13 @@ class Fracturing:
         loads = np.zeros(len(self._cells.shares))
         softens, values = np.zeros(len(loads), np.bool_), []
         for part in parts:
+            beside = self._cells.places(part.slot, part.block)
             for n, numbers in enumerate(sides):
                 old = [
                     value[part.owner] for value, its in zip(previous, numbers, strict=True) if its
                 ]
                 new = [value for value, its in zip(part.numbers, numbers, strict=True) if its]
-                cell, is_intact = part.beside[n], np.all([value == 0.0 for value in old], axis=0)
+                cell, is_intact = beside[n], np.all([value == 0.0 for value in old], axis=0)
                 softens[cell[~is_intact]] = True
                 values.append((part, n, cell, is_intact, old, new))
         change, waiting = 0.0, []
@@ -203,17 +205,21 @@ class Fracturing:
 
 
 class UpdatedBonds(NamedTuple):
-    """Bonds along a slot with updated state variables. `beside` are the places of the cells on both
-    sides in the flat array of cells, for a model that softens cells."""
+    """Bonds along a slot, which start in a block, with updated state variables."""
 
     owner: Owner
+    slot: Slot
+    block: Block
     d: Vector
-    r: Vector
     limits: Any
     numbers: list[NDArray[Any]]
     intact: NDArray[np.bool_]
     cells: tuple[CellStress, ...]
-    beside: tuple[NDArray[np.intp], ...]
+
+    @property
+    def r(self) -> Vector:
+        """Rest offset of the bonds."""
+        return self.slot.rest
 
 
 BREAKS_AT_REST = Hindrance("an equilibrium with breaking bonds", "fracture")

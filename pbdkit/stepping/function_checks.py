@@ -6,8 +6,7 @@ return values of the wrong shape or type, which fail far from their cause. At th
 they are called a few times: those of a rule for a sample of particles with small displacements,
 those of a fracture model for a sample of bonds with different strains. This takes a few
 milliseconds (measured for a rule: 3 ms for 100 particles, 6 ms for 160 000; for a fracture model:
-6 and 7 ms). The conformance suite
-is more thorough.
+6 and 7 ms). The conformance suite is more thorough.
 """
 
 from __future__ import annotations
