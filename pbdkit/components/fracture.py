@@ -426,7 +426,7 @@ _DAMAGE = Remembered("damage", "damage of the bond, from 0 to 1 where it is brok
 """Declaration of the damage of a bond."""
 
 
-LEAST = 0.25
+MIN_SQUARED_COSINE = 0.25
 """Smallest squared cosine between a bond and the normal of a crack in the strain of the bond across
 the crack."""
 DIRECTIONS = 360
@@ -765,12 +765,12 @@ def _normal(stress: CellStress, r: Vector) -> Vector:
 
     It is the direction of the largest principal value of the mean stress of the cell and, if the
     bond is stretched more than the cell, of a tension along the bond. The tension is the difference
-    of the strains over LEAST, as in `_strain` for a bond along the crack.
+    of the strains over MIN_SQUARED_COSINE, as in `_strain` for a bond along the crack.
     """
     x, y, square = r.x * r.x, r.y * r.y, squared_length(r)
     mean = stress.strain_xx * x + stress.strain_yy * y + 2.0 * stress.strain_xy * r.x * r.y
     more = stress.strain - mean / square
-    more = where(more > 0.0, more, 0.0) / (LEAST * square)
+    more = where(more > 0.0, more, 0.0) / (MIN_SQUARED_COSINE * square)
     half = 0.5 * (stress.xx - stress.yy + more * (x - y))
     xy = stress.xy + more * r.x * r.y
     radius = np.sqrt(half * half + xy * xy)
@@ -781,8 +781,8 @@ def _normal(stress: CellStress, r: Vector) -> Vector:
 
 
 def _squared_extent(r: Vector, normal: Vector) -> Number:
-    """Return the squared length of a bond across a crack, at least LEAST times |r|²."""
-    across, least = r.x * normal.x + r.y * normal.y, LEAST * squared_length(r)
+    """Return the squared length of a bond across a crack, at least MIN_SQUARED_COSINE |r|²."""
+    across, least = r.x * normal.x + r.y * normal.y, MIN_SQUARED_COSINE * squared_length(r)
     squared: Number = where(across * across > least, across * across, least)
     return squared
 
@@ -794,7 +794,7 @@ def _strain(stress: CellStress, r: Vector, normal: Vector, c: Constants) -> Numb
     Here ε is the strain of the bond, ε_e and ε_t are the mean strains of the cell across and along
     the crack, and ε_σ is its mean stress across the crack over Young's modulus. If the cell has no
     strain but ε_e and ε_t, κ is ε_σ. For bonds at more than 60° to e, κ is reduced by (n · e)² /
-    LEAST.
+    MIN_SQUARED_COSINE.
     """
     x, y = normal.x, normal.y
     xx, yy, xy = x * x, y * y, 2.0 * x * y
