@@ -30,7 +30,6 @@ from pbdkit.array_types import Floats, Indices
 from pbdkit.equilibrium.cell_forces import CellShape, DamagingCells, changed_cells, shapes_of
 from pbdkit.equilibrium.error_bound import UNKNOWN, ErrorBound, UnconvergedError
 from pbdkit.equilibrium.load_stepping import (
-    TINY,
     EquilibriumPath,
     Reached,
     SeparatedError,
@@ -641,7 +640,7 @@ def follow(
     while True:
         end = math.floor(since) + 1
         part = min(part, end - since)
-        moment = end if part > (end - since) * (1.0 - TINY) else since + part
+        moment = since + part  # Exact, since each part is a power of two.
         try:
             reached, error_bound = branch.advance(state, _target(scene, moment), end)
         except UnconvergedError as error:

@@ -451,11 +451,10 @@ def clear(x, i):
 
 
 @njit(**FAST)
-def relax(grid, b, x, row, weight, start, upwards):
+def relax(grid, b, x, weight, start, upwards):
     """Relax x += weight · D⁻¹ (b - K x) on even rows, then on odd ones; with `upwards` in the
-    opposite order. With `start` the iteration begins from x = 0, and values of x are ignored. `row`
-    is a buffer for one row."""
-    rows = grid.first.size - 1
+    opposite order. With `start` the iteration begins from x = 0, and values of x are ignored."""
+    rows, row = grid.first.size - 1, np.empty((2, x.shape[2]), x.dtype)
     for i in range(1 if upwards else 0, rows + 1, 2):
         # Relax row i, then row i - 1, since both rows next to row i - 1 are relaxed by then.
         if i < rows:
@@ -556,7 +555,7 @@ def run():
     rough, exact = grids
     r, z, half = np.zeros((2, 8, 8)), np.zeros((2, 8, 8), np.float32), np.float32(0.5)
     product(exact, r, r.copy(), np.zeros(8))
-    relax(rough, z, z.copy(), np.zeros((2, 8), np.float32), half, True, False)
+    relax(rough, z, z.copy(), half, True, False)
     coarse, code = np.zeros((2, 6, 6), np.float32), np.zeros((6, 6), np.int32)
     restrict(rough, z, z, (1, 1), code, coarse)
     scaled(exact, (1.0,) * 4, np.ones((2, 4)), r, r)

@@ -150,18 +150,17 @@ class GridLevel:
     def __init__(self, grid: StencilGrid, halved: tuple[int, int] = (0, 0)) -> None:
         self.grid, self.given, self.halved = grid, grid.given(PRECISION), halved
         self.x, self.b = grid.field(PRECISION), grid.field(PRECISION)
-        self._row = np.zeros((2, grid.code.shape[1]), PRECISION)
 
     def down(self, b: Floats, below: GridLevel) -> None:
         """Relax K x = b from zero, and restrict the residual to the next grid."""
         kernel, x = kernels(), self.x
-        kernel.relax(self.given, b, x, self._row, PRECISION(WEIGHT), True, False)
+        kernel.relax(self.given, b, x, PRECISION(WEIGHT), True, False)
         kernel.restrict(self.given, b, x, self.halved, below.grid.code, below.b)
 
     def up(self, b: Floats, coarse: Floats) -> None:
         """Add the correction of the next grid, and relax."""
         self.grid.add_coarser(coarse, self.halved, self.x)
-        kernels().relax(self.given, b, self.x, self._row, PRECISION(WEIGHT), False, True)
+        kernels().relax(self.given, b, self.x, PRECISION(WEIGHT), False, True)
 
 
 class Grids(ABC):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import pbdkit
+from pbdkit.equilibrium.branch import follow
 from pbdkit.equilibrium.cell_forces import DamagingCells, changed_cells, shapes_of
 from pbdkit.errors import DivergedError, ExperimentError
 from pbdkit.io.netcdf import NetcdfSink
@@ -158,6 +159,15 @@ def test_branch_of_an_elastic_body_is_a_straight_line():
     np.testing.assert_allclose(both.load_resultant.values[:, 0, 1], 0.001 * both.load_factor.values)
 
 
+def test_branch_ends_with_the_last_step():
+    scene = build_scene(
+        as_experiment(controlled(NOTCHED, MOUTH, fracture={"type": "none"}, steps=3))
+    )
+    state = initial_state(scene)
+    assert [reached.moment for reached in follow(scene, state, Watch())] == [1, 2]
+    assert state.step == 3
+
+
 def test_work_of_the_load_is_stored_or_dissipated(notched):
     force, moved = notched.load_resultant.values[:, 0, 0], notched.load_displacement.values[:, 0, 0]
     assert 0 < force.argmax() < 12
@@ -229,13 +239,16 @@ def test_bonds_that_soften_by_their_strain_are_followed():
 
 @pytest.mark.parametrize("fracture", ["cohesive", "damage"])
 @pytest.mark.parametrize("lattice", ["square", "hexagonal"])
-def test_forces_of_single_cells_add_up_to_those_of_the_lattice(lattice, fracture):
+@pytest.mark.parametrize("stiffness", [1.0, {"otherwise": 1.0, "weak": 0.5}], ids=["one", "two"])
+def test_forces_of_single_cells_add_up_to_those_of_the_lattice(lattice, fracture, stiffness):
     law = {"failure": 0.3} if fracture == "damage" else {"energy": 1.0}
     square = lattice == "square"
     given = NOTCHED | {
         "lattice": {"type": lattice, "a": 1.0},
         "body": {"type": "rectangle", "width": 5.5, "height": 4.2},
         "neighbours": {"type": "chebyshev" if square else "coordination", "shells": 1},
+        "regions": {"weak": {"type": "rectangle", "width": 2.6, "height": 9.0}},
+        "rule": NOTCHED["rule"] | {"stiffness": stiffness},
         "fracture": {"type": fracture, "onset": 0.01} | law,
     }
     scene = build_scene(as_experiment(given))

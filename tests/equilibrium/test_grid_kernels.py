@@ -78,7 +78,7 @@ def test_products_and_relaxation_are_those_of_the_dense_matrix(kernels: Any, see
         inverse[n : n + 2, n : n + 2] = np.linalg.inv(K[n : n + 2, n : n + 2])
     for start, upwards in ((False, False), (False, True), (True, False), (True, True)):
         found, exact = x.copy(), flat(matrix, x) * (not start)
-        kernels.relax(grid, b, found, np.zeros((2, x.shape[2])), 0.7, start, upwards)
+        kernels.relax(grid, b, found, 0.7, start, upwards)
         for parity in (1, 0) if upwards else (0, 1):
             step = 0.7 * inverse @ (flat(matrix, b) - K @ exact)
             exact = exact + np.where(row % 2 == parity, step, 0.0)

@@ -1,5 +1,6 @@
 """Rows of grids that processes share, and solutions of a given relative accuracy."""
 
+from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -8,7 +9,17 @@ import pytest
 from hypothesis import given, strategies as st
 from scene_strategies import samples
 
-from pbdkit.equilibrium.system import ALL, Strip, coarser_size, solved
+from pbdkit.equilibrium.sparse import MatrixSystem
+from pbdkit.equilibrium.system import (
+    ALL,
+    Moves,
+    Strip,
+    coarser_size,
+    random_displacements,
+    solved,
+)
+from pbdkit.progress import Watch
+from tests.equilibrium.test_lattice_system import LINEAR, at_rest
 
 
 @st.composite
@@ -77,3 +88,15 @@ def test_random_fields_are_between_minus_one_and_one():
     assert field.max() < 1.0
     assert abs(field.mean()) < 0.05
     assert field.std() == pytest.approx(1.0 / np.sqrt(3.0), rel=0.05)
+
+
+@pytest.mark.parametrize("relaxation", [1.0, 0.05])
+def test_a_translation_changes_moves_by_rounding_errors_only(relaxation):
+    """They are at most as large as assumed, and not a hundred times smaller."""
+    solver = {"type": "stepping", "relaxation": relaxation}
+    scene, rest = at_rest(LINEAR["elastic"] | {"solver": solver})
+    moves, u, far = Moves(scene), random_displacements(scene, 1.0), 1e6
+    near, moved = (moves.at(replace(rest, u=u + shift), 1) for shift in (0.0, far))
+    system = MatrixSystem(scene, rest, "lu", Watch(), 1)
+    assumed = system.amplification * moves.rounding(u + far)
+    assert 0.01 * assumed <= np.abs(moved - near).max() <= assumed

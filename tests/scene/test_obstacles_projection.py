@@ -6,6 +6,7 @@ be moved. None of them may be nearer, in the metric of the particle, than the co
 
 from __future__ import annotations
 
+from itertools import permutations
 from typing import Any
 
 import numpy as np
@@ -236,3 +237,11 @@ def test_faces_meet_where_both_are(shape: int, like: int) -> None:
         assert count == crossings(face, other)
         met += count
     assert met
+
+
+def test_corners_of_a_triangle_may_have_any_order() -> None:
+    """The circle of radius (3 + 4 - 5) / 2 touches all sides from inside."""
+    at = np.array([[1.0, -1.0, 5.0], [1.0, 1.0, 0.0]])
+    for corners in permutations([[0.0, 0.0], [4.0, 0.0], [0.0, 3.0]]):
+        wall = outline_of(Obstacle(shape={"type": "polygon", "vertices": corners}).shape)
+        np.testing.assert_allclose(wall.facing(*at)[0], [-1.0, 1.0, 1.0])
