@@ -411,7 +411,7 @@ def test_changing_neighbours_cannot_converge():
 def test_endless_motions_never_converge_and_give_the_reason():
     swinging = {"type": "oscillation", "amplitude": [1.0, 0.0], "period": 30.0}
     leaders = [HOLD_LEFT, {"select": {"edge": "right"}, "motion": swinging}]
-    ds = run(sheet(leaders=leaders, steps=100))
+    ds = run(sheet(leaders=leaders, steps=200))
     assert ds.attrs["status"] == "complete"
     reason = "completed all steps, not converged: leaders do not come to rest before its end"
     assert ds.attrs["stop_reason"] == reason

@@ -457,6 +457,15 @@ def test_leaders_driven_into_an_obstacle_give_a_warning() -> None:
     assert any(known in warning for warning in warnings)
 
 
+def test_leaders_inside_an_obstacle_at_the_turn_of_their_path_only_give_a_warning() -> None:
+    """The obstacle is .5 above the top edge, and the path begins in step 3."""
+    path = {"type": "path", "steps": [4, 8], "displacements": [[0.0, 0.6], [0.0, 0.0]]}
+    lid = {"shape": {"half_plane": {"point": [0.0, 8.5], "normal": [0.0, -1.0]}}}
+    given = block(leaders=[{"select": {"edge": "top"}, "motion": path, "from": 3}])
+    scene = build_scene(pbdkit.Experiment(**given | {"obstacles": [lid], "steps": 20}))
+    assert sum("into obstacles.0 by step 6;" in warning for warning in scene.warnings) == 1
+
+
 def test_run_is_reproduced_from_the_dataset_alone() -> None:
     ds = run(pressed("wedge", 0.4))
     again = pbdkit.rerun(ds)
