@@ -376,7 +376,7 @@ def fill_with_cells(
     # Whether a particle belongs to the body depends on its cells. Whether these are omitted depends
     # on the cells that share a corner with them, and the area fractions of those depend on the
     # distance from the outline at their corners.
-    padding = max(2 * margin, 4 * _reach_of(tiling))
+    padding = 4 * _reach_of(tiling)
     for begin in range(low[0], high[0], line_count):
         end = min(begin + line_count, high[0])
         ends = (begin - padding, *low[1:]), (end + padding, *high[1:])
@@ -393,8 +393,7 @@ def fill_with_cells(
 def margin_of(tiling: Tiling) -> int:
     """Return the maximum number of layers of sites outside an outline that belong to cells cut by
     it."""
-    corners = (corner for polygon in tiling.polygons for corner in polygon.corners)
-    return max(2, *(abs(n) for corner in corners for n in corner.site))
+    return max(2, _reach_of(tiling))
 
 
 def _reach_of(tiling: Tiling) -> int:

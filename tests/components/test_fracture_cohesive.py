@@ -359,6 +359,20 @@ def test_bonds_of_a_bent_cell_soften_by_their_own_openings():
     assert all(len(values) == 1 and 0.0 < values[0] < 1.0 for values in diagonals)
 
 
+def test_softened_cell_changes_the_forces_on_its_corners_only():
+    """The upper corners of the middle cell move up, so that only this cell softens."""
+    grid = {"type": "grid", "columns": 4, "rows": 4}
+    given, intact = (Strained(rule=ELASTIC, body=grid) for _ in range(2))
+    corners = (np.abs(given.X) < 1.0).all(axis=1)
+    u = np.zeros_like(given.X)
+    u[corners & (given.X[:, 1] > 0.0), 1] = 0.95 * ONSET
+    given.put(u)
+    assert 0.0 < given.state.bond_values[0].max() < 1.0
+    u = np.random.default_rng(3).normal(size=u.shape)
+    changes = (np.abs(given.forces(u) - intact.forces(u)) > 1e-9).any(axis=1)
+    assert np.array_equal(changes, corners)
+
+
 TORN = {
     "body": {"type": "grid", "columns": 6, "rows": 6},
     "cuts": [{"from": [-1.0, 2.5], "to": [2.2, 2.5], "at": 10}],

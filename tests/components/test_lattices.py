@@ -10,6 +10,7 @@ from pbdkit.components.lattices import CentredRectangular, Hexagonal, Oblique, R
 from pbdkit.components.neighbours import Chebyshev, Coordination, Euclidean
 from pbdkit.lattice.cells import tiling_of
 from pbdkit.lattice.neighbourhood import build_neighbourhood
+from pbdkit.plugin.lattice import Cell, Vector
 
 LATTICES = [
     Square(a=1.3),
@@ -75,6 +76,15 @@ def test_weighted_neighbours_are_the_sites_within_the_radius(lattice, weights):
     assert means == sorted(means)
     for shell, mean in zip(shells, means, strict=True):
         np.testing.assert_allclose([distance(o.rest) for o in shell], mean, rtol=1e-6)
+
+
+@pytest.mark.parametrize("vectors", [((1, 1), (0, 1)), ((1, 0), (1, 1)), ((2, 1), (1, 1))])
+def test_neighbours_by_index_distance_do_not_depend_on_the_repeat_cell(vectors):
+    """On the square lattice, all cells of area 1 have the neighbours |Δx|, |Δy| ≤ 2."""
+    cell = Cell(tuple(Vector(float(x), float(y)) for x, y in vectors), primitive=vectors)
+    shells = Chebyshev(shells=2).shells_around(cell, 0)
+    expected = {rest for rest in product(range(-2, 3), repeat=2) if rest != (0, 0)}
+    assert {tuple(offset.rest) for shell in shells for offset in shell} == expected
 
 
 @pytest.mark.parametrize("lattice", LATTICES, ids=lambda lattice: lattice.type)

@@ -89,6 +89,17 @@ def test_slot_through_a_body_separates_it(name, angle, width, middle):
     assert over != under
 
 
+@pytest.mark.parametrize(
+    ("left", "right", "area"), [(4.9, 5.2, 89.0), (4.8, 5.1, 89.0), (4.85, 5.15, 80.0)]
+)
+def test_only_the_larger_cells_beside_a_slot_remain(left, right, area):
+    """The slot contains a column of particles at x = 5. Of the two columns of cells beside it, that
+    with the larger area remains, and none if both areas are equal."""
+    cut = slot(right - left, 90.0, np.array([(left + right) / 2, 5.0]))
+    scene = scene_of(LATTICES["square"], less(cut))
+    assert scene.cells.share.sum() == pytest.approx(area, rel=1e-4)
+
+
 @pytest.mark.parametrize("name", LATTICES)
 def test_mirror_images_stay_mirror_images(name):
     b = {"square": 1.0, "rectangular": 0.7, "hexagonal": 3**0.5}[name]
