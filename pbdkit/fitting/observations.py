@@ -773,9 +773,9 @@ class RunPrediction(Prediction):
 class RunObservation(Observation):
     """Measured values that are predicted by a run.
 
-    If the run has a control, it follows a softening body, and the predictions are continuous but
-    not smooth functions of the parameters: the slope of a curve changes where a cell begins to
-    soften. Derivatives are then differences over a finite change of the parameters.
+    If the run has a control, it follows a softening body, and the predictions are not smooth
+    functions of the parameters: they jump where another cell begins to soften. Derivatives are then
+    differences over a finite change of the parameters, within one branch.
 
     Parameters
     ----------

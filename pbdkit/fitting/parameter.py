@@ -31,11 +31,12 @@ LARGE_STEP = 1e-2
 Errors of the prediction are larger for these parts.
 """
 
-SECANT_STEP = 2e-2
-"""Step of differences, as a fraction of the value, of predictions that are not smooth."""
+SECANT_STEP = 2.5e-3
+"""Step of differences, as a fraction of the value, of predictions that jump to other branches."""
 
-BRANCH = 3.0
-"""Ratio of the changes in both directions above which the larger one is another branch."""
+BRANCH = 0.5
+"""Difference between the quotients in both directions, over the smaller one, above which the
+function follows another branch in the direction of the larger one."""
 
 MIN_STEP = 1e-7
 """Smallest step as a fraction of the value, used near a bound."""
@@ -209,11 +210,11 @@ class Parameter:
         return sum(weight / step * change for weight, change in zip(WEIGHTS, changes, strict=True))
 
     def difference(self, experiment: Experiment, function: Callable[[Experiment], Any]) -> Any:
-        """Return the quotient of differences of a function that is not smooth.
+        """Return the quotient of differences of a function that jumps to other branches.
 
         The parameter is changed by a fraction of its value in both directions, or in one of them if
-        there is no value in the other one. If the change in one direction is much larger than in
-        the other, the function has followed another branch there, and the smaller one is used.
+        there is no value in the other one. If both quotients differ, the function has followed
+        another branch in the direction of the larger one, and the smaller one is used.
 
         Parameters
         ----------
@@ -237,7 +238,7 @@ class Parameter:
             raise UnconvergedError(f"there is no prediction for {self.path} near {value:g}")
         changes.sort(key=lambda change: float(np.linalg.norm(change)))
         first, last = changes[0], changes[-1]
-        is_branch = np.linalg.norm(last) > BRANCH * np.linalg.norm(first) > 0.0
+        is_branch = np.linalg.norm(last - first) > BRANCH * np.linalg.norm(first) > 0.0
         return first if is_branch else (first + last) / 2.0
 
     def _ends(

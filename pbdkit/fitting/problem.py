@@ -468,8 +468,7 @@ STALLED = 0.5
 cost.
 
 The cost then has a kink: where bonds are broken, the stiffness of cells is not a smooth function of
-the parameters of `orthotropic`. Derivatives of predictions that are not smooth are averages over a
-range of about this size.
+the parameters of `orthotropic`.
 """
 
 SLACK = 1e-9
@@ -503,8 +502,7 @@ CONVERGED_SECANT = 0.15
 """Largest step of a converged fit of predictions that are not smooth."""
 KINK = 0.5
 """Increase of the cost that is accepted for predictions that are not smooth, in units of the mean
-square residual. The cost has local minima of about this depth, and the fit is where the projection
-of the residuals on the derivatives vanishes, which are averages."""
+square residual, so that small jumps of the predictions do not end the fit."""
 MAX_STALLED_SECANT = 1.5
 """Largest step, in standard errors, with which such a fit ends with a warning, not an error."""
 MIN_RADIUS_SECANT = 2e-3
