@@ -368,16 +368,16 @@ def write_breaking_kernel(plan: Plan) -> tuple[str, list[str]]:
     for frame in FollowFrame.of(plan.scene):
         frame.emit_for(LatticeWriter(plan, follow, Passes(None, [])), "flat_u")
     moves, derive = _write_moves(plan, follow, general), _write_derivative(plan, general)
-    judge, mark, changed = write_bond_pass(plan), _write_mark(plan), _write_changed(plan)
+    bonds, mark, changed = write_bond_pass(plan), _write_mark(plan), _write_changed(plan)
     update, equilibrate = _write_known(plan, derive), _write_equilibrate(plan, follow, moves)
     run = Function(plan.shared, "run", "arrays", "step", "tolerance", "slack", "max_changes")
     run.add(0, "for n in range(max_changes):", f"    {mark.call()}")
     run.add(1, f"if not {update.call()} or not {equilibrate.call('tolerance')}:")
     run.add(2, f"return n, {FAILED}")
-    run.add(1, judge.call(*ROWS, "0", "kind.shape[2]"), f"if not {changed.call('slack')}:")
+    run.add(1, bonds[-1].call(*ROWS, "0", "kind.shape[2]"), f"if not {changed.call('slack')}:")
     run.add(2, f"return n, {CONVERGED}")
     run.add(0, f"return max_changes, {UNFINISHED}")
-    functions = [general, moves, derive, judge, mark, changed, update, equilibrate]
+    functions = [general, moves, derive, *bonds, mark, changed, update, equilibrate]
     return write_module(plan, [follow, *functions] if follow.lines else functions, run)
 
 

@@ -125,8 +125,9 @@ def write_sweep(plan: Plan, level: Level, whole: Whole, events: Function | None)
     return out
 
 
-def write_bonds(plan: Plan) -> Function:
-    """Return the function with which a thread updates and breaks its bonds, plane after plane."""
+def write_bonds(plan: Plan) -> list[Function]:
+    """Return the functions with which a thread updates and breaks its bonds, plane after plane. The
+    last function calls the others."""
     out = Function(plan.shared, "judge_bonds", *THREAD)
     out.add(0, sweeps.parameters(plan, plan.levels[-1])[-1])
     out.add(0, "cells = flat_broken.size // len(ends)", "for n in range(len(ends)):")
@@ -139,7 +140,7 @@ def write_bonds(plan: Plan) -> Function:
     out.add(3, "here = ends[n, 0] * cells + j", "there = here + end_steps[n]")
     out.add(3, *sweeps.bond_update(plan, "flat_u_@[there] - flat_u_@[here]", "here").write)
     out.add(3, *sweeps.marking_lines(plan, "n * cells + j", "here"))
-    return out
+    return [*sweeps.bond_functions(plan), out]
 
 
 def _aliases(plan: Plan, level: Level) -> list[str]:
@@ -292,16 +293,16 @@ def write_kernel(plan: Plan, whole: Whole, alone: bool) -> tuple[str, list[str]]
     has to synchronise only its own threads, which takes much less time than a synchronisation of
     several blocks."""
     events = sweeps.write_events(plan) if plan.judged else None
-    judge = write_bonds(plan) if plan.bonds_first else None
+    bonds = write_bonds(plan) if plan.bonds_first else []
     moves = [write_sweep(plan, level, whole, events) for level in plan.levels]
-    functions = [function for function in (events, judge, *moves) if function]
+    functions = [*([events] if events else []), *bonds, *moves]
     run = Function(plan.shared, "run", "step", "count")
     run.add(0, "me, threads = cuda.grid(1), cuda.gridsize(1)")
     if not alone:
         run.add(0, "everyone = cuda.cg.this_grid()")
     run.add(0, "for moment in range(count):", "    step += 1")
     wait = "cuda.syncthreads()" if alone else "everyone.sync()"
-    writer = ThreadWriter(plan, run, Passes(judge, moves), wait)
+    writer = ThreadWriter(plan, run, Passes(bonds[-1] if bonds else None, moves), wait)
     writer.begin()
     for operation in program_of(plan.scene):
         operation.emit(writer)

@@ -175,13 +175,23 @@ for _operation, _sign in (("add", "+"), ("sub", "-"), ("mul", "*"), ("truediv", 
     overload(getattr(operator, _operation))(_arithmetic(_sign))
 
 
-def compiled(function: Function) -> Any:
+INTERNAL: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+"""Options of functions that only compiled functions call. They take less time to compile, because
+there are no wrappers for calls from Python and C."""
+
+
+def compiled(function: Function, **options: Any) -> Any:
     """Return the function, compiled by numba together with every Python function that it calls.
 
     `error_model="numpy"` allows divisions and roots to be vectorised. fastmath is off, so that
     every operation is rounded as in numpy.
     """
-    return numba.njit(error_model="numpy")(with_helpers_ready(function))
+    return numba.njit(error_model="numpy", **options)(with_helpers_ready(function))
+
+
+def internal(function: Function) -> Any:
+    """Return the compiled function for calls from compiled functions only."""
+    return compiled(function, **INTERNAL)
 
 
 def with_helpers_ready(function: Function) -> Function:
@@ -283,7 +293,7 @@ def load_kernel(source: str, functions: dict[str, Function], arguments: tuple[An
     parts += [numba.__version__, np.__version__, sys.version, processor, interpreted]
     key = hashlib.sha256("\n".join(map(str, parts)).encode()).hexdigest()[:32]
     if (index := (_cache_folder(), key)) not in _loaded:
-        names = {name: compiled(function) for name, function in functions.items()}
+        names = {name: internal(function) for name, function in functions.items()}
         kernel = None if interpreted else _cached_kernel(source, key, names, arguments)
         _loaded[index] = kernel or _prepared(source, names, arguments)
     return _loaded[index]
@@ -388,8 +398,9 @@ def _prepared(
     file = str(folder / SOURCE) if folder else "<kernel>"
     module = ModuleType(folder.name if folder else "kernel")
     scope = vars(module)
-    scope |= words(compiled) | names
-    scope.update(njit=numba.njit, part=numba.njit(error_model="numpy"), prange=numba.prange)
+    scope |= words(internal) | names
+    part = numba.njit(error_model="numpy", **INTERNAL)
+    scope.update(njit=numba.njit, part=part, prange=numba.prange)
     scope["CACHED"] = bool(folder)
     if folder:
         module.__file__ = file

@@ -24,13 +24,13 @@ def write_kernel(plan: Plan, program: Program, groups: Groups) -> tuple[str, lis
     """Return the source of a module, and the names of the arrays that it reads. Its function
     ``run(arrays, step, count, chunks, band)`` makes `count` steps."""
     events = sweeps.write_events(plan) if plan.judged else None
-    judge = sweeps.write_bond_pass(plan) if plan.bonds_first else None
-    functions = [function for function in (events, judge) if function]
+    bonds = sweeps.write_bond_pass(plan) if plan.bonds_first else []
+    functions = [*([events] if events else []), *bonds]
     moves = list[Function]()
     for level in plan.levels:
         functions += _sweep(plan, level, groups, events)
         moves.append(functions[-1])
-    passes = Passes(judge, moves)
+    passes = Passes(bonds[-1] if bonds else None, moves)
     run = Function(plan.shared, "run", "arrays", "step", "count", "chunks", "band")
     writer = LatticeWriter(plan, run, passes)
     pieces = write_piece(plan, program, passes) if goes_deep(plan) else []
@@ -49,7 +49,8 @@ def write_kernel(plan: Plan, program: Program, groups: Groups) -> tuple[str, lis
 def write_module(plan: Plan, functions: Iterable[Function], run: Function) -> tuple[str, list[str]]:
     """Return the source of a module with the given functions and the entry `run`, and the names of
     the arrays that it reads."""
-    jit = f'@njit(parallel={plan.parallel}, error_model="numpy", nogil=True, cache=CACHED)'
+    options = f'parallel={plan.parallel}, error_model="numpy", nogil=True, no_cfunc_wrapper=True'
+    jit = f"@njit({options}, cache=CACHED)"
     head = [jit, f"def run({', '.join(run.own)}):", f"    {', '.join(run.used)}, = arrays"]
     return module_text(plan, functions, head, run), run.used
 

@@ -88,16 +88,14 @@ def _chosen(plan: Plan, owner: str, n: str, on_right: str) -> str:
 def damage_lines(plan: Plan) -> list[str]:
     """Return lines that compute the damage of the cells around the particle of sublattice s at the
     flat place `at_j`."""
-    cells, bonds = _table_shape(plan.scene)
+    cells, _ = _table_shape(plan.scene)
     lines = []
     for cell in range(cells):
-        for b in range(bonds):
-            lines.append(f"owner = at_j + cell_bonds[s, {cell}, {b}]")
-            at = f"[s, {cell}, {b}]"
-            damage = _chosen(plan, "owner", f"cell_planes{at}", f"cell_sides{at}")
-            lines += (
-                [f"own = {damage}", _raised(f"m{cell}", "own")] if b else [f"m{cell} = {damage}"]
-            )
+        at = f"[s, {cell}, b]"
+        damage = _chosen(plan, "owner", f"cell_planes{at}", f"cell_sides{at}")
+        lines += [f"m{cell} = {plan.real}(-np.inf)", "for b in range(cell_bonds.shape[2]):"]
+        lines += [f"    owner = at_j + cell_bonds{at}", f"    own = {damage}"]
+        lines.append(f"    {_raised(f'm{cell}', 'own')}")
     return [*lines, f"around = ({', '.join(f'm{cell}' for cell in range(cells))},)"]
 
 
@@ -189,38 +187,38 @@ def marking_lines(plan: Plan, owner: str, there: str) -> list[str]:
     ]
 
 
-def stress_lines(plan: Plan, owner: str) -> list[str]:
-    """Return lines that compute the stress of the cells to the `left` and `right` of a bond d, r of
-    plane n. `owner` is the flat place of the end at which the bond is stored."""
+def write_cell_stress(plan: Plan) -> Function:
+    """Return the function that computes the stress of the cell on one side of a bond d, r of plane
+    n. `owner` is the flat place of the end at which the bond is stored."""
     corners = len(plan.scene.neighbourhood.tiling.polygons[0].corners)
     count = len(Stiffness._fields)
-    ratio_names = [f"cell_ratios[{m}]" for m in range(count)]
-    lines = list[str]()
-    for side, name in enumerate(("left", "right")):
-        lines.append(f"cell = {owner} + body_steps[n, {side}]")
-        if plan.mixed:
-            ratio_names = [f"flat_ratios[{count} * cell + {m}]" for m in range(count)]
-        lines.append(f"origin = {owner} + corner_steps[n, {side}, 0]")
-        for k in range(1, corners):
-            lines.append(f"corner = {owner} + corner_steps[n, {side}, {k}]")
-            lines += plan.each(f"e{k}_@ = flat_u_@[corner] - flat_u_@[origin]")
-        for a in plan.axes:
-            for b, axis in enumerate(plan.axes):
-                rates = ((k, f"corner_rates[n, {side}, {k - 1}, {b}]") for k in range(1, corners))
-                terms = (f"e{k}_{a} * {rate}" for k, rate in rates)
-                lines.append(f"g_{a}{axis} = {' + '.join(terms)}")
-        ratios = f"Stiffness({', '.join(ratio_names)})"
-        more = f"{ratios}, d, r, flat_body[cell]"
-        lines.append(f"{name} = CellStress(*stress(g_xx, g_xy, g_yx, g_yy, {more}))")
-    return lines
+    out = Function(plan.shared, "cell_stress", "n", "side", "owner", "d", "r", *_cell_arrays(plan))
+    out.add(0, "cell = owner + body_steps[n, side]", "origin = owner + corner_steps[n, side, 0]")
+    for k in range(1, corners):
+        out.add(0, f"corner = owner + corner_steps[n, side, {k}]")
+        out.add(0, *plan.each(f"e{k}_@ = flat_u_@[corner] - flat_u_@[origin]"))
+    for a in plan.axes:
+        for b, axis in enumerate(plan.axes):
+            rates = ((k, f"corner_rates[n, side, {k - 1}, {b}]") for k in range(1, corners))
+            out.add(0, f"g_{a}{axis} = {' + '.join(f'e{k}_{a} * {rate}' for k, rate in rates)}")
+    ratios = f"flat_ratios[{count} * cell + #]" if plan.mixed else "cell_ratios[#]"
+    stiffness = ", ".join(ratios.replace("#", str(m)) for m in range(count))
+    more = f"Stiffness({stiffness}), d, r, flat_body[cell]"
+    out.add(0, f"return CellStress(*stress(g_xx, g_xy, g_yx, g_yy, {more}))")
+    return out
+
+
+def _cell_arrays(plan: Plan) -> list[str]:
+    """Return the names of the flat arrays that the function of `write_cell_stress` receives."""
+    return ["flat_body", *(["flat_ratios"] if plan.mixed else []), *plan.each("flat_u_@")]
 
 
 def stress_arrays(scene: Scene, real: np.dtype[Any]) -> dict[str, NDArray[Any]]:
-    """Return the tables that the lines of `stress_lines` read. They have an entry for the left and
-    the right side of the bonds along each slot. A bond is stored at one of its ends. `corner_steps`
-    are index offsets in flat arrays from this end to the corners of the cell, and `body_steps` is
-    the offset to the place of the area fraction of the cell. `corner_rates` contains the weights of
-    the corners in the displacement gradient."""
+    """Return the tables that the function of `write_cell_stress` reads. They have an entry for the
+    left and the right side of the bonds along each slot. A bond is stored at one of its ends.
+    `corner_steps` are index offsets in flat arrays from this end to the corners of the cell, and
+    `body_steps` is the offset to the place of the area fraction of the cell. `corner_rates`
+    contains the weights of the corners in the displacement gradient."""
     assert scene.cells is not None
     stresses, shape = CellStresses(scene), scene.raster.shape
     steps, rates, shares = [], [], []
@@ -542,8 +540,9 @@ def _pattern(parts: Sequence[int], names: list[str], kind: str) -> str:
     return ", ".join(components)
 
 
-def write_bond_pass(plan: Plan) -> Function:
-    """Return the function that updates and breaks the bonds in a range of rows and columns."""
+def write_bond_pass(plan: Plan) -> list[Function]:
+    """Return the functions that update and break the bonds in a range of rows and columns. The last
+    function calls the others."""
     rows, columns = ("first_row", "last_row"), ("first_column", "last_column")
     out = Function(plan.shared, "judge_bonds", *rows, *columns)
     axes = range(len(plan.axes))
@@ -567,7 +566,12 @@ def write_bond_pass(plan: Plan) -> Function:
     if plan.tears:
         out.add(0, f"bond_base, base = {plan.flat('n')}, {plan.flat('ends[n, 0]')}")
     _write_judging(out, plan)
-    return out
+    return [*bond_functions(plan), out]
+
+
+def bond_functions(plan: Plan) -> list[Function]:
+    """Return the functions that the lines of `bond_update` call."""
+    return [write_cell_stress(plan)] if plan.softens_cells else []
 
 
 class BondUpdate(NamedTuple):
@@ -594,8 +598,10 @@ def bond_update(plan: Plan, d: str, owner: str) -> BondUpdate:
     if changing:
         cells = ""
         if plan.softens_cells:
-            look += stress_lines(plan, owner)
-            cells = ", left, right"
+            stress = write_cell_stress(plan)
+            for side in (0, 1):
+                arguments = f"{side}", owner, "d", "r", *_cell_arrays(plan)
+                cells += f", {stress.call('n', *arguments)}"
         look.append(f"new = update(d, r, Constants({c}), q{cells})")
     for position, m in enumerate(changing):
         look.append(f"new{m} = new[{position}]")
