@@ -794,7 +794,8 @@ def _strain(stress: CellStress, r: Vector, normal: Vector, c: Constants) -> Numb
     Here ε is the strain of the bond, ε_e and ε_t are the mean strains of the cell across and along
     the crack, and ε_σ is its mean stress across the crack over Young's modulus. If the cell has no
     strain but ε_e and ε_t, κ is ε_σ. For bonds at more than 60° to e, κ is reduced by (n · e)² /
-    MIN_SQUARED_COSINE.
+    MIN_SQUARED_COSINE, and the part of ε that the cell does not have on average by the square of
+    it: in a cell that is bent, no bond along the crack softens.
     """
     x, y = normal.x, normal.y
     xx, yy, xy = x * x, y * y, 2.0 * x * y
@@ -803,8 +804,12 @@ def _strain(stress: CellStress, r: Vector, normal: Vector, c: Constants) -> Numb
     strain_across = stress.strain_xx * xx + stress.strain_yy * yy + stress.strain_xy * xy
     strain_along = stress.strain_xx * yy + stress.strain_yy * xx - stress.strain_xy * xy
     contraction = stress_across * _along(normal, c.along_y, c.across) - strain_across
-    own = stress.strain * squared_length(r) - strain_along * (along * along)
-    strain: Number = (own + contraction * (across * across)) / _squared_extent(r, normal)
+    mean = stress.strain_xx * (r.x * r.x) + stress.strain_yy * (r.y * r.y)
+    mean = mean + 2.0 * stress.strain_xy * (r.x * r.y)
+    extent = _squared_extent(r, normal)
+    own = mean - strain_along * (along * along) + contraction * (across * across)
+    more = (stress.strain * squared_length(r) - mean) * (across * across / extent)
+    strain: Number = (own + more) / extent
     return strain
 
 

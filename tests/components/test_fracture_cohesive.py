@@ -373,6 +373,29 @@ def test_softened_cell_changes_the_forces_on_its_corners_only():
     assert np.array_equal(changes, corners)
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("bending", [0.15, 0.25, 0.5, 0.9])
+def test_bent_cell_under_compression_does_not_soften(axis, bending):
+    """Both edges of a cell are compressed, one more than the other: nothing softens, in particular
+    not as by a crack along an edge. Where an edge is stretched, it softens and the other does not.
+    """
+    for bending_, softens in ((bending, 0), (1.0 + 3.0 * bending, 1)):
+        given = Strained(rule=SPRINGS, body={"type": "grid", "columns": 2, "rows": 2})
+        along, across = given.X[:, axis], given.X[:, 1 - axis]
+        u = np.zeros_like(given.X)
+        u[:, axis] = 10.0 * ONSET * along * (2.0 * bending_ * across - 1.0)
+        given.put(u)
+        edge = np.eye(2)[axis]
+        damaged = [
+            np.count_nonzero(values)
+            for plane, values in zip(
+                given.scene.neighbourhood.planes, given.state.bond_values[0], strict=True
+            )
+            if bending_ < 1.0 or np.array_equal(np.abs(tuple(plane.slot.rest)), edge)
+        ]
+        assert sum(damaged) == softens
+
+
 TORN = {
     "body": {"type": "grid", "columns": 6, "rows": 6},
     "cuts": [{"from": [-1.0, 2.5], "to": [2.2, 2.5], "at": 10}],
