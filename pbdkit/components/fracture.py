@@ -551,7 +551,8 @@ class Cohesive(UsesStiffness, SoftensCells, Parting):
     Softening localises in a band one cell wide, which is torn when it has dissipated `energy` per
     unit length of the crack. The stress is the effective stress, that of the undamaged cell. The
     normal e of the crack is the direction of the largest principal stress at the bond when
-    softening begins, and does not change any more.
+    softening begins, and does not change any more. Only a crack perpendicular to it, with the
+    normal t, can open as well; the damage is then by the larger opening.
 
     The force of the bond in the cell is reduced by the damage D = 1 - σ/κ. Here κ is the strain of
     the bond across the crack as the maximum over time: (ε - ε_t (n · t)²) / (n · e)², with the
@@ -734,7 +735,9 @@ class Cohesive(UsesStiffness, SoftensCells, Parting):
     @staticmethod
     def load(stress: CellStress, r: Vector, c: Constants, p: Parameters) -> Number:
         """Return κ divided by the onset."""
-        return _strain(stress, r, _normal(stress, r), c) / c.onset_strain
+        strain, _ = _strain(stress, r, _normal(stress, r), c)
+        load: Number = strain / c.onset_strain
+        return load
 
     @staticmethod
     def breaks(d: Vector, r: Vector, c: Constants, p: Parameters) -> Condition:
@@ -745,18 +748,25 @@ class Cohesive(UsesStiffness, SoftensCells, Parting):
 def _of_cell(
     stress: CellStress, damage: Any, normal_x: Any, normal_y: Any, r: Any, c: Any, p: Any
 ) -> Any:
-    """Return the damage of a bond and the normal of its crack, in a cell under a stress."""
+    """Return the damage of a bond and the normal e of its crack, in a cell under a stress.
+
+    The damage is the larger of those by the strains across the crack and across a second one, which
+    is perpendicular to it.
+    """
     softens = (normal_x != 0.0) | (normal_y != 0.0)
     normal = _normal(stress, r)
     normal = Vector(where(softens, normal_x, normal.x), where(softens, normal_y, normal.y))
-    strain = _strain(stress, r, normal, c)
+    strain, extent = _strain(stress, r, normal, c)
     softens = softens | ((strain > c.onset_strain) & (stress.share > 0.0))
-    flexibility = _along(normal, c.along_y, c.across)
-    stiffness = _along(normal, c.stiff_y, c.stiff_across)
-    failure = c.release * flexibility * flexibility * stiffness * p.stretch
-    failure = failure / np.sqrt(_squared_extent(r, normal))
-    failure = where(softens, failure, 2.0 * p.stretch * c.onset_strain)
-    damage = where(softens, _damage(strain, c.onset_strain, failure, damage, p), damage)
+    tangent = Vector(-normal.y, normal.x)
+    cracks = [(normal, strain, extent)]
+    cracks += [(tangent, *_strain(stress, r, tangent, c, contracts=0.0))]
+    for across, strain, extent in cracks:
+        flexibility = _along(across, c.along_y, c.across)
+        stiffness = _along(across, c.stiff_y, c.stiff_across)
+        failure = c.release * flexibility * flexibility * stiffness * p.stretch / extent
+        failure = where(softens, failure, 2.0 * p.stretch * c.onset_strain)
+        damage = where(softens, _damage(strain, c.onset_strain, failure, damage, p), damage)
     return damage, where(softens, normal.x, 0.0), where(softens, normal.y, 0.0)
 
 
@@ -780,22 +790,20 @@ def _normal(stress: CellStress, r: Vector) -> Vector:
     return Vector(along_x, where(xy < 0.0, -along_y, along_y))
 
 
-def _squared_extent(r: Vector, normal: Vector) -> Number:
-    """Return the squared length of a bond across a crack, at least MIN_SQUARED_COSINE |r|²."""
-    across, least = r.x * normal.x + r.y * normal.y, MIN_SQUARED_COSINE * squared_length(r)
-    squared: Number = where(across * across > least, across * across, least)
-    return squared
-
-
-def _strain(stress: CellStress, r: Vector, normal: Vector, c: Constants) -> Number:
-    """Return κ, the strain of a bond across a crack with the normal e: (ε - ε_t (n · t)²) / (n ·
-    e)² + ε_σ - ε_e.
+def _strain(
+    stress: CellStress, r: Vector, normal: Vector, c: Constants, contracts: float = 1.0
+) -> tuple[Any, Any]:
+    """Return κ, the strain of a bond across a crack with the normal e, (ε - ε_t (n · t)²) / (n ·
+    e)² + ε_σ - ε_e, and the length of the bond across the crack.
 
     Here ε is the strain of the bond, ε_e and ε_t are the mean strains of the cell across and along
     the crack, and ε_σ is its mean stress across the crack over Young's modulus. If the cell has no
     strain but ε_e and ε_t, κ is ε_σ. For bonds at more than 60° to e, κ is reduced by (n · e)² /
     MIN_SQUARED_COSINE, and the part of ε that the cell does not have on average by the square of
     it: in a cell that is bent, no bond along the crack softens.
+
+    The contraction ε_σ - ε_e is multiplied by `contracts`. It is omitted for a second crack,
+    because ε_t is then mostly the opening of the first one, by which the cell does not contract.
     """
     x, y = normal.x, normal.y
     xx, yy, xy = x * x, y * y, 2.0 * x * y
@@ -806,11 +814,11 @@ def _strain(stress: CellStress, r: Vector, normal: Vector, c: Constants) -> Numb
     contraction = stress_across * _along(normal, c.along_y, c.across) - strain_across
     mean = stress.strain_xx * (r.x * r.x) + stress.strain_yy * (r.y * r.y)
     mean = mean + 2.0 * stress.strain_xy * (r.x * r.y)
-    extent = _squared_extent(r, normal)
-    own = mean - strain_along * (along * along) + contraction * (across * across)
-    more = (stress.strain * squared_length(r) - mean) * (across * across / extent)
-    strain: Number = (own + more) / extent
-    return strain
+    square, squared = squared_length(r), across * across
+    extent = where(squared > MIN_SQUARED_COSINE * square, squared, MIN_SQUARED_COSINE * square)
+    own = mean - strain_along * (along * along) + contracts * contraction * squared
+    more = (stress.strain * square - mean) * (squared / extent)
+    return (own + more) / extent, np.sqrt(extent)
 
 
 def _damage(strain: Any, onset: Any, failure: Any, damage: Any, p: Any) -> Any:

@@ -396,6 +396,17 @@ def test_bent_cell_under_compression_does_not_soften(axis, bending):
         assert sum(damaged) == softens
 
 
+@pytest.mark.parametrize("lattice", ["square", "hexagonal"])
+def test_cell_that_softened_across_one_axis_is_torn_across_the_other(lattice):
+    """The bonds that cross the second crack transmit no force."""
+    given = Strained(rule=ELASTIC, lattice=lattice, body=GRID)
+    first = given.stress([[0.0, 0.0], [0.0, 1.5 * ONSET]])
+    assert 0.0 < first[1, 1] < ONSET
+    torn = given.stress([[5.0 * ENERGY / ONSET, 0.0], [0.0, 0.0]])
+    assert given.broken > 0
+    np.testing.assert_allclose(torn[0], 0.0, atol=1e-12)
+
+
 TORN = {
     "body": {"type": "grid", "columns": 6, "rows": 6},
     "cuts": [{"from": [-1.0, 2.5], "to": [2.2, 2.5], "at": 10}],
