@@ -23,9 +23,15 @@ from numba import njit
 
 CACHED = globals().get("CACHED", False)
 """True if numba caches the compiled functions on disk."""
+EXACT = {"cache": CACHED, "no_cfunc_wrapper": True}
+"""Options of numba for loops over grids."""
+FAST = {**EXACT, "error_model": "numpy", "nogil": True, "fastmath": True}
+"""Options of numba for loops over fields."""
+INTERNAL = {"no_cpython_wrapper": True, "cache": False}
+"""Further options of functions that only compiled functions call."""
 
 
-@njit(cache=CACHED)
+@njit(**EXACT)
 def runs(code, first, begin, end, lone, place, which):
     """Fill the lists of runs and lone places of a grid, and return how many there are of each.
     Lists that are too short are not filled."""
@@ -51,7 +57,7 @@ def runs(code, first, begin, end, lone, place, which):
     return r, s
 
 
-@njit(cache=CACHED)
+@njit(**EXACT)
 def coarse_kinds(kind, halved, out):
     """Compute the kinds of the next grid. A place of the next grid that lies outside the body is
     free if values at free places of this grid are interpolated from it, unless leaders are
@@ -72,7 +78,7 @@ def coarse_kinds(kind, halved, out):
             out[n, m] = place_kind
 
 
-@njit(cache=CACHED)
+@njit(**EXACT)
 def coarse_codes(code, kind, halved, out):
     """Compute the codes of the next grid, and return the largest. The code is -1 where no particle
     is free, and 0 where all stencils of this grid around the place are the most frequent one. All
@@ -97,7 +103,7 @@ def coarse_codes(code, kind, halved, out):
     return count
 
 
-@njit(cache=CACHED)
+@njit(**{**EXACT, **INTERNAL})
 def beside(q, half):
     """Return the two places of the next grid between which a place of this grid lies, and the
     weight of the first of them in the interpolation. The place of this grid is q places away from
@@ -108,7 +114,7 @@ def beside(q, half):
     return (q - 1) // 2 if q % 2 else q // 2, (q + 1) // 2, 0.5 if q % 2 else 1.0
 
 
-@njit(cache=CACHED)
+@njit(**EXACT)
 def galerkin(code, stencils, coarse, halved, out):
     """Compute out[k], the stencil of Pᵀ K P at the place with the code k on the next grid."""
     a1, b1 = halved
@@ -137,7 +143,7 @@ def galerkin(code, stencils, coarse, halved, out):
                                         out[k, 3 * ta + tb + 4, e] += w * stencils[code[i, j], s, e]
 
 
-@njit(cache=CACHED)
+@njit(**EXACT)
 def asymmetry(code, stencils):
     """Return the largest entry of K - Kᵀ. All places with the most frequent stencil have equal
     entries, so that only one pair of these places is compared in each direction."""
@@ -160,7 +166,7 @@ def asymmetry(code, stencils):
     return worst
 
 
-@njit(cache=CACHED)
+@njit(**EXACT)
 def symmetrise(code, stencils):
     """Replace K by (K + Kᵀ) / 2 at places with separate stencils."""
     for i in range(1, code.shape[0] - 1):
@@ -175,7 +181,7 @@ def symmetrise(code, stencils):
                     stencils[number, s, e] = stencils[neighbour, 8 - s, t] = mean
 
 
-@njit(cache=CACHED)
+@njit(**EXACT)
 def balance(code, stencils, factor):
     """Compute the row factors that make K as symmetric as possible. Places that already have a
     factor, which is not 0, keep it; from them the computation spreads to their neighbours, until no
@@ -225,10 +231,6 @@ def run_coarsening():
     asymmetry(code, stencils)
     symmetrise(code, stencils)
     balance(code, stencils, np.zeros((8, 8)))
-
-
-FAST = {"error_model": "numpy", "nogil": True, "cache": CACHED, "fastmath": True}
-"""Options of numba for loops over fields."""
 
 
 @njit(**FAST)
@@ -347,7 +349,7 @@ the first `lone` place, followed by the total numbers of runs and lone places; a
 stencils and the inverses of their diagonal blocks."""
 
 
-@njit(**FAST)
+@njit(**{**FAST, **INTERNAL})
 def around(x, i, lo, hi):
     """Return views of the row of a run and of the rows before and after it, for the components
     along x and y. The views extend from one place before the run to one place after it."""
@@ -359,7 +361,7 @@ def around(x, i, lo, hi):
     return previous[0], previous[1], x[0, i, lo:hi], x[1, i, lo:hi], following[0], following[1]
 
 
-@njit(**FAST)
+@njit(**{**FAST, **INTERNAL})
 def of_row(c, x, y, j):
     """Return the product of three places of a row and the 12 numbers of one row of a stencil."""
     x0, y0, x1, y1, x2, y2 = x[j], y[j], x[j + 1], y[j + 1], x[j + 2], y[j + 2]
@@ -368,7 +370,7 @@ def of_row(c, x, y, j):
     return kx, ky
 
 
-@njit(**FAST)
+@njit(**{**FAST, **INTERNAL})
 def of_run(c, rows, j):
     """Return K x at place j of a run."""
     ax, ay = of_row(c[0], rows[0], rows[1], j)
@@ -377,7 +379,7 @@ def of_run(c, rows, j):
     return ax + bx + cx, ay + by + cy
 
 
-@njit(**FAST)
+@njit(**{**FAST, **INTERNAL})
 def of_lone(grid, e, x, i):
     """Return K x at a place with a separate stencil."""
     j, k = grid.place[e], grid.which[e]
@@ -410,7 +412,7 @@ def product(grid, x, out, sums):
         sums[i] = part
 
 
-@njit(**FAST)
+@njit(**{**FAST, **INTERNAL})
 def residual(grid, i, b, x, out):
     """Compute out = b - K x of a row, (axis, place)."""
     for e in range(grid.first[i], grid.first[i + 1]):
@@ -426,7 +428,7 @@ def residual(grid, i, b, x, out):
         out[0, j], out[1, j] = b[0, i, j] - kx, b[1, i, j] - ky
 
 
-@njit(**FAST)
+@njit(**{**FAST, **INTERNAL})
 def solve_own(grid, i, r, weight, x):
     """Compute x += weight · D⁻¹ r at the places of a row, with the diagonal blocks D."""
     d = grid.inverse
@@ -442,7 +444,7 @@ def solve_own(grid, i, r, weight, x):
         x[1, i, j] += weight * (c[k, 2] * r[0, j] + c[k, 3] * r[1, j])
 
 
-@njit(**FAST)
+@njit(**{**FAST, **INTERNAL})
 def clear(x, i):
     """Set a row to zero."""
     for v in range(2):
@@ -502,7 +504,7 @@ def restrict(grid, b, x, halved, code, out):
                     to[m] = of[m] if free[m] >= 0 else of[m] * 0
 
 
-@njit(**FAST)
+@njit(**{**FAST, **INTERNAL})
 def whole_residual(grid, i, b, x, out):
     """Compute the residual of a row, zero where no particle is free and for a row outside the
     grid."""
@@ -513,7 +515,7 @@ def whole_residual(grid, i, b, x, out):
         residual(grid, i, b, x, out)
 
 
-@njit(**FAST)
+@njit(**{**FAST, **INTERNAL})
 def add_rows(sums, row, share, overwrite):
     """Add share · row to `sums` for both axes or, with `overwrite`, replace `sums` by it."""
     for v in range(2):
