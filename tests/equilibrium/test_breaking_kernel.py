@@ -94,6 +94,20 @@ def test_compiled_kernel_breaks_like_numpy(monkeypatch):
     np.testing.assert_allclose(found.u, expected.u, rtol=0, atol=1e-10)
 
 
+def test_kernel_follows_changes_of_leaders_like_numpy(monkeypatch):
+    """The particle in the middle is held at first, and later it follows its neighbours."""
+    motion = {"type": "velocity", "velocity": [0.6, 0.1], "steps": 3}
+    middle = {"select": {"nearest": [[2.0, 1.0]]}, "motion": {"type": "hold"}, "until": 1}
+    left, right = ({"select": {"edge": edge}} for edge in ("left", "right"))
+    leaders = [left | {"motion": {"type": "hold"}}, right | {"motion": motion}, middle]
+    scene = scene_of(fracture=DAMAGE, leaders=leaders, steps=3)
+    expected, _ = equilibrium_state(scene)
+    settled = by_kernel(monkeypatch)
+    found, _ = equilibrium_state(scene)
+    assert any(well for well, _ in settled)
+    np.testing.assert_allclose(found.u, expected.u, rtol=0, atol=1e-10)
+
+
 def test_repeated_increment_is_bitwise_identical(monkeypatch):
     by_kernel(monkeypatch)
     scene = scene_of(fracture=DAMAGE)

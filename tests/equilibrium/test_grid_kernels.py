@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import importlib.util
+import sys
 from collections.abc import Iterator
+from types import FunctionType
 from typing import Any
 
 import numpy as np
@@ -268,3 +270,20 @@ def test_vector_operations(kernels: Any) -> None:
     single.reshape(4, 9, 4)[range(4), 2, range(4)] = -1.0
     kernels.clear_noise(single, 0.9)
     assert np.count_nonzero(single) == 4
+
+
+def test_run_compiles_every_function(kernels):
+    """A function that is neither called by it nor named in a called function would be compiled
+    later, during a calculation."""
+    calls = set()
+    sys.setprofile(lambda frame, event, _: calls.add(frame.f_code) if event == "call" else None)
+    try:
+        kernels.run()
+    finally:
+        sys.setprofile(None)
+    functions = [value for value in vars(kernels).values() if isinstance(value, FunctionType)]
+    code = {f.__name__: f.__code__ for f in functions if f.__module__ == kernels.__name__}
+    compiled = {name for name in code if code[name] in calls}
+    for _ in code:
+        compiled |= {named for name in compiled for named in code[name].co_names if named in code}
+    assert compiled == set(code)

@@ -212,3 +212,10 @@ def test_operator_of_a_softened_state_equals_the_step():
     if not same:
         pytest.fail("the damage was to have come to rest")
     np.testing.assert_allclose(predicted, moved, rtol=0, atol=1e-13)
+
+
+def test_only_cuts_at_step_0_are_part_of_the_initial_state():
+    cuts = [{"from": [x, -1.0], "to": [x, 1.0], "at": at} for x, at in ((1.5, 0), (3.5, 1))]
+    given = chain(5, fracture={"type": "none"}, cuts=cuts)
+    state = initial_state(build_scene(pbdkit.Experiment(**given)))
+    assert state.broken_step[state.broken_step >= 0].tolist() == [0]

@@ -1,6 +1,7 @@
 """Every engine gives the numbers of the numpy engine, to the last bit."""
 
 import time
+from typing import Literal
 
 import numba
 import numpy as np
@@ -254,6 +255,12 @@ def test_kernel_logic_on_any_number_of_threads(parts, banded, interpreted):
     assert_bitwise_equal(scene, CompiledStepper(scene), CompiledStepper(scene, 2), calls=(1, 2, 7))
 
 
+def test_band_contains_at_least_one_row(interpreted, monkeypatch):
+    monkeypatch.setattr(compiled_stepper, "BAND", 1)
+    scene = build_scene(pbdkit.Experiment(**sheet(fracture=DAMAGE)))
+    assert_bitwise_equal(scene, CompiledStepper(scene), calls=(1,))
+
+
 @pytest.mark.parametrize("name", in_turn(THREADED, 4))
 def test_any_number_of_threads_gives_the_same(name, banded):
     scene = banded(THREADED[name])
@@ -369,6 +376,32 @@ def test_large_scenes_are_compiled_unless_prevented(monkeypatch):
     asked = experiment | {"solver": {"type": "stepping", "engine": "compiled"}}
     with pytest.raises(pbdkit.ExperimentError, match=r"solver.engine: .* numba is not installed"):
         choose(build_scene(pbdkit.Experiment(**asked)))
+
+
+class Wedged(pbdkit.plugin.StartsCracked, pbdkit.FractureModel):
+    """Never breaks a bond, and opens the initial crack."""
+
+    type: Literal["wedged"] = "wedged"
+
+    def segments(self):
+        return [((6.5, 2.5), (6.5, 9.0))]
+
+    def constants(self, slot):
+        return {}
+
+    @staticmethod
+    def breaks(d, r, c, p):
+        return d.x > 1e9
+
+    @staticmethod
+    def fictitious(u, r, p):
+        return -0.1 * r
+
+
+def test_initial_crack_that_opens_moves_the_body_from_the_first_step(interpreted):
+    leaders = [{"select": {"edge": "left"}, "motion": {"type": "hold"}}]
+    scene = build_scene(pbdkit.Experiment(**sheet(fracture=Wedged(), leaders=leaders)))
+    assert assert_bitwise_equal(scene, CompiledStepper(scene)).u.any()
 
 
 def test_particles_beyond_the_reach_of_leaders_are_untouched():
