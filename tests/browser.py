@@ -11,7 +11,14 @@ from urllib.parse import urlsplit
 import pytest
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-OPTIONS = ["--no-sandbox", "--enable-unsafe-swiftshader", "--use-angle=swiftshader"]
+OPTIONS = [
+    "--no-sandbox",
+    "--enable-unsafe-swiftshader",
+    "--use-angle=swiftshader",
+    # One process draws all pages, and none is started in advance.
+    "--renderer-process-limit=1",
+    "--disable-features=SpareRendererForSitePerProcess",
+]
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 
