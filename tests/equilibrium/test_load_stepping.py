@@ -145,6 +145,21 @@ def test_late_leaders_start_at_rest_if_undamped_steps_diverge(nu, begin):
     np.testing.assert_allclose(ds.u[-1], rest.u[-1], rtol=0, atol=1e-10)
 
 
+def test_late_leaders_hold_a_loaded_body_where_steps_have_moved_it():
+    """The load moves the body as a whole in each step before."""
+    parts = {
+        "neighbours": {"type": "chebyshev", "shells": 1},
+        "rule": {"type": "elastic", "poisson_ratio": 0.3},
+        "frame": {"type": "natural"},
+        "loads": [{"select": {"edge": "right"}, "force": [0.01, 0.004]}],
+    }
+    held = run(sheet(5, 4, **parts, leaders=[LEFT | {"from": 8}], steps=9, record=LAST))
+    stepped = run(sheet(5, 4, **parts, leaders=[], steps=7, solver={"type": "stepping"}))
+    left = np.isclose(held.reference[:, 0], 0.0)
+    np.testing.assert_allclose(held.u[-1][left], stepped.u[-1][left], rtol=0, atol=1e-15)
+    assert abs(stepped.u[-1][left]).max() > 1e-4
+
+
 def test_check_lists_changes_before_which_the_body_converges(tmp_path):
     leaders = [LEFT | {"until": 9}, pulled(1.0, 0.5), LEFT | {"from": 30}]
     path = tmp_path / "late.yaml"

@@ -187,6 +187,7 @@ def test_detached_part_ends_the_run_at_the_last_equilibrium():
     assert ds.attrs["status"] == "separated"
     assert "certificate" not in ds.attrs
     reason = ds.attrs["stop_reason"]
+    assert reason.startswith("the body came apart between step ")
     assert "the bond between particles" in reason
     assert "a part of" in reason
     assert f"the last equilibrium is that of step {ds.time.values[-1]}" in reason

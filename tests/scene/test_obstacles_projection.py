@@ -245,3 +245,10 @@ def test_corners_of_a_triangle_may_have_any_order() -> None:
     for corners in permutations([[0.0, 0.0], [4.0, 0.0], [0.0, 3.0]]):
         wall = outline_of(Obstacle(shape={"type": "polygon", "vertices": corners}).shape)
         np.testing.assert_allclose(wall.facing(*at)[0], [-1.0, 1.0, 1.0])
+
+
+@pytest.mark.parametrize("name", SHAPES)
+def test_the_nearest_face_is_that_of_the_outline(name: str) -> None:
+    wall, at = outline(name), places(100)
+    distances = [face.distance for face in wall.faces(*at)]
+    np.testing.assert_allclose(np.min(distances, axis=0), np.abs(wall.facing(*at)[0]), atol=1e-12)
