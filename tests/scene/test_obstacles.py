@@ -466,6 +466,17 @@ def test_leaders_inside_an_obstacle_at_the_turn_of_their_path_only_give_a_warnin
     assert sum("into obstacles.0 by step 6;" in warning for warning in scene.warnings) == 1
 
 
+@pytest.mark.parametrize("a", [1.0, 0.5])
+def test_a_turning_plate_is_displaced_at_the_distance_of_a_lattice_constant(a: float) -> None:
+    """It turns about its point, which stays. The chord of the other point is 2a sin(30° / 2)."""
+    turn = {"type": "rotation", "centre": [1.0, -1.0], "angle": 7.5, "steps": 4}
+    plate = {"shape": {"half_plane": {"point": [1.0, -1.0], "normal": [0.6, 0.8]}}, "motion": turn}
+    given = block(lattice={"type": "square", "a": a}, obstacles=[plate])
+    (barrier,) = build_scene(pbdkit.Experiment(**given)).barriers
+    chords = np.hypot(*barrier.offset(4).T)
+    np.testing.assert_allclose(chords, [0.0, 2.0 * a * np.sin(np.radians(15.0))], atol=1e-15)
+
+
 def test_run_is_reproduced_from_the_dataset_alone() -> None:
     ds = run(pressed("wedge", 0.4))
     again = pbdkit.rerun(ds)
