@@ -51,7 +51,7 @@ def test_implicit_steps_relax_a_part_that_hangs_by_one_bond(size):
 
 
 def test_a_distance_is_that_by_the_current_system():
-    """It is computed once for each system and residual."""
+    """Each combination of system and residual is evaluated once."""
     count = []
 
     def by(distance):
