@@ -211,6 +211,9 @@ class Linearisation:
         Prediction of each observation.
     scales
         Whether numbers of the experiment depend on an unknown Young's modulus.
+    branch : (unknown,), optional
+        Distance of the minimum on another branch of the predictions, times the square root of the
+        probability of this branch.
     """
 
     z: Floats
@@ -218,6 +221,7 @@ class Linearisation:
     jacobian: Floats
     predictions: tuple[Prediction, ...]
     scales: bool = False
+    branch: Floats | None = None
 
     @property
     def is_exact(self) -> bool:
@@ -969,6 +973,11 @@ def _identify_directions(
     else:
         factor = _variance_of_loss(at.residuals, problem.size, loss)
         variance[:rank] = np.minimum(factor / sizes**2, NULL_VARIANCE)
+    if at.branch is not None:
+        along = vectors[:rank] @ (at.branch / scale)
+        widened, axes = np.linalg.eigh(np.diag(variance[:rank]) + np.outer(along, along))
+        variance[:rank] = np.minimum(widened, NULL_VARIANCE)
+        vectors[:rank] = axes.T @ vectors[:rank]
     shares = np.abs(vectors[rank:] * (size * scale))
     vectors[rank:][shares < INVOLVED * shares.max(axis=1, initial=0.0)[:, None]] = 0.0
     directions = Directions(vectors, variance, scale)
@@ -1009,8 +1018,11 @@ def _principal_axes(product: Floats, sizes: Floats) -> tuple[Floats, Floats]:
 def with_correlated_errors(problem: Problem, solution: Solution, loss: Loss) -> Solution:
     """Return the solution with standard errors that account for correlations of the residuals.
 
-    They do not change if no correlation is significant.
+    They do not change if no correlation is significant. If predictions are not smooth, standard
+    errors also account for another branch.
     """
+    if not problem.is_smooth:
+        solution = _with_other_branch(problem, solution, loss)
     at = solution.at
     size = np.linalg.norm(at.jacobian, axis=0)
     basis, *_ = _singular(at.jacobian / np.where(size > 0.0, size, 1.0))
@@ -1038,6 +1050,40 @@ def with_correlated_errors(problem: Problem, solution: Solution, loss: Loss) -> 
         correlations=tuple(correlations),
         independent=solution.directions,
     )
+
+
+def _with_other_branch(problem: Problem, solution: Solution, loss: Loss) -> Solution:
+    """Return the solution with standard errors that account for another branch of the predictions.
+
+    Each parameter is changed by its standard error in both directions. If the predictions jump in
+    between, the minimum on the branch there is computed with the derivatives at the solution. With
+    its distance d and its cost χ², the covariance C becomes C + w d dᵀ, where w is the likelihood
+    exp(-χ² / 2) divided by the sum of the likelihoods of both minima. The largest such change is
+    used.
+    """
+    at, (low, high), count = solution.at, problem.bounds(), len(problem.unknowns)
+    cost, rise = cost_of(at.residuals, loss), rise_of_loss(at.residuals, problem.size, loss)
+    branch = np.zeros(problem.size)
+    errors = solution.errors[:count]
+    for n, change in [*enumerate(-errors), *enumerate(errors)]:
+        z = at.z.copy()
+        z[n] = np.clip(z[n] + change, low[n], high[n])
+        try:
+            beside = replace(at, z=z, residuals=problem.residuals(z))
+        except (UnconvergedError, ExperimentError):
+            continue
+        step = _linear_step(beside, low - z, high - z, loss)
+        excess = (cost_of(beside.residuals - at.jacobian @ step, loss) - cost) / rise
+        weight = (1.0 - np.tanh(excess / 4.0)) / 2.0
+        distance = np.sqrt(weight) * (z + step - at.z)
+        size, largest = (
+            np.linalg.norm(solution.directions.errors(each)) for each in (distance, branch)
+        )
+        if size > largest:
+            branch = distance
+    at = replace(at, branch=branch)
+    directions, unidentified = _identify_directions(problem, at, loss)
+    return replace(solution, at=at, directions=directions, unidentified=unidentified)
 
 
 def _variance_of_loss(residuals: Floats, unknowns: float, loss: Loss) -> float:

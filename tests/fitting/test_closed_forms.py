@@ -437,6 +437,36 @@ def test_each_linearisation_is_counted(is_smooth: bool) -> None:
     np.testing.assert_allclose(solution.at.jacobian.T @ solution.at.residuals, 0.0, atol=0.05)
 
 
+@pytest.mark.parametrize("jump", [0.0, 3.0])
+def test_errors_contain_another_branch(jump: float) -> None:
+    """Predictions jump within a standard error, so that the minimum beyond is displaced by `jump`
+    at the same cost: both minima are equally likely, and half of its square is added."""
+    J, r = np.ones((9, 1)), RNG.normal(size=9)
+    r -= r.mean()
+    prediction: Any = SimpleNamespace(is_exact=True, is_linear=True)
+
+    def residuals(z: Any) -> Any:
+        return r - J @ (z - jump * (z > 0.1))
+
+    free = np.full(1, np.inf)
+    parameter: Any = SimpleNamespace(path="rule.a")
+    stub: Any = SimpleNamespace(
+        unknowns=(problem.Unknown(parameter, -50.0, 50.0),),
+        size=1,
+        with_modulus=False,
+        is_smooth=False,
+        at=lambda z, near, is_exact=False: Linearisation(z, residuals(z), J, (prediction,)),
+        residuals=residuals,
+        bounds=lambda: (-free, free),
+        rows=list,
+    )
+    solution = problem.solved(stub, np.zeros(1))
+    variance = max(1.0, r @ r / 8) / 9
+    np.testing.assert_allclose(solution.covariance, variance)
+    solution = problem.with_correlated_errors(stub, solution, "linear")
+    np.testing.assert_allclose(solution.covariance, variance + jump**2 / 2)
+
+
 def test_measured_zeros_have_a_size() -> None:
     """Initial noise is a fraction of it, by which residuals are divided."""
     assert fit._size(np.zeros(4)) > 0.0
