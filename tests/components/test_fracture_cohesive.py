@@ -64,10 +64,10 @@ class Strained:
         self.state.u.reshape(2, -1)[:, self._place] = np.asarray(u).T
         return self._followers.forces(self.state.u, self.state).reshape(2, -1)[:, self._place].T
 
-    def put(self, u):
+    def put(self, u, *, in_turn=False):
         """Displacements by which the bonds are judged."""
         self.state.u.reshape(2, -1)[:, self._place] = np.asarray(u).T
-        self._fracturing.break_bonds(self.state.u, self.state, 1)
+        return self._fracturing.break_bonds(self.state.u, self.state, 1, in_turn=in_turn)
 
     def stress(self, gradient):
         """The mean stress over Young's modulus under a gradient, by which the bonds are judged."""
@@ -405,6 +405,19 @@ def test_cell_that_softened_across_one_axis_is_torn_across_the_other(lattice):
     torn = given.stress([[5.0 * ENERGY / ONSET, 0.0], [0.0, 0.0]])
     assert given.broken > 0
     np.testing.assert_allclose(torn[0], 0.0, atol=1e-12)
+
+
+def test_cells_begin_to_soften_one_after_the_other():
+    """The strain increases with x. A second cell waits until the damage of the first is constant;
+    under a larger strain all others wait."""
+    given = Strained(rule=ELASTIC, body={"type": "grid", "columns": 6, "rows": 2})
+    strain = ONSET * (1.5 + 0.05 * given.X[:, 0])
+    u = np.stack([0.0 * strain, strain * given.X[:, 1]], axis=1)
+    counts = [0]
+    for scale, must_wait in ((1.0, False), (1.0, False), (1.5, True), (1.5, False)):
+        assert given.put(scale * u, in_turn=True) == must_wait
+        counts.append(sum(np.count_nonzero(value) for value in given.state.bond_values[:2]))
+    assert counts[0] < counts[1] < counts[2] == counts[3] < counts[4]
 
 
 TORN = {

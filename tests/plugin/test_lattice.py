@@ -13,9 +13,10 @@ from pbdkit.model.bodies import Body, Box
 from pbdkit.model.motions import Velocity
 from pbdkit.scene.scene import build_scene
 from pbdkit.stepping.engine_choice import choose, make_engine
+from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state
 
-SIZES, STEPS = (5, 4, 3), 12
+SIZES, STEPS = (5, 3, 4), 12
 PULL, TURN = (0.11, 0.02, -0.03), (-0.02, 0.05, 0.04)
 
 
@@ -42,6 +43,9 @@ class Brick(Body):
         return np.maximum.reduce(beyond).astype(float)
 
 
+INTACT = {"type": "none"}
+
+
 def faces():
     """The sites of both ends, and of the whole window in the order of the numbers."""
     window = list(product(*(range(-1, n + 1) for n in SIZES)))
@@ -49,7 +53,7 @@ def faces():
     return [s for s in body if s[0] == 0], [s for s in body if s[0] == SIZES[0] - 1], window
 
 
-def scene(engine, threshold, *, moves=True):
+def scene(engine, fracture, *, moves=True):
     """Return the block, with its ends moved apart. The experiment file has bodies and motions of
     the plane only: those of space are put in."""
     left, right, window = faces()
@@ -60,9 +64,7 @@ def scene(engine, threshold, *, moves=True):
         body={"type": "grid", "columns": 3, "rows": 3},
         neighbours={"type": "coordination", "shells": 1},
         rule={"type": "barycentre"},
-        fracture={"type": "none"}
-        if threshold is None
-        else {"type": "threshold", "thresholds": [threshold]},
+        fracture=fracture,
         leaders=[
             {"select": {"numbers": [window.index(s) + 1 for s in face]}, "motion": {"type": "hold"}}
             for face in (left, right)
@@ -86,7 +88,8 @@ def scene(engine, threshold, *, moves=True):
 def test_cubic_lattice_steps_like_plain_loops(engine, threshold, request):
     if threshold is None:  # what tears is compiled
         request.getfixturevalue("interpreted")
-    block = scene(engine, threshold)
+    torn = {"type": "threshold", "thresholds": [threshold]}
+    block = scene(engine, INTACT if threshold is None else torn)
     left, right, _ = faces()
     history, broken = plain_space.simulate(
         SIZES, [(left, TURN, 4), (right, PULL, 4)], STEPS, threshold
@@ -102,8 +105,18 @@ def test_cubic_lattice_steps_like_plain_loops(engine, threshold, request):
         assert np.unique(state.broken_step).tolist() == [-1, *sorted(set(broken.values()))]
 
 
+def test_bonds_in_space_soften_as_by_numpy(interpreted):
+    block = scene("compiled", {"type": "damage", "onset": 0.05, "failure": 0.3})
+    state, known = initial_state(block), initial_state(block)
+    state = make_engine(block, choose(block))[0].advance(state, 4)
+    known = Stepper(block).advance(known, 4)
+    assert np.count_nonzero(known.broken_step >= 0)
+    for mine, others in zip(state.arrays(), known.arrays(), strict=True):
+        np.testing.assert_array_equal(mine, others)
+
+
 def test_dataset_has_three_axes():
-    block = scene("numpy", None, moves=False)
+    block = scene("numpy", INTACT, moves=False)
     ds = pbdkit.run(block.experiment, progress=False)
     assert ds.axis.values.tolist() == ["x", "y", "z"]
     assert ds.position.shape == (STEPS + 1, block.raster.count, 3)
@@ -116,6 +129,6 @@ def test_spectrum_matches_the_closed_form():
     ends = (SIZES[0] - 1, SIZES[0] - 1), (SIZES[1], SIZES[1]), (SIZES[2], SIZES[2])
     a, b, c = (np.pi * np.arange(count) / parts for count, parts in ends)
     grid = np.cos(a[1:, None, None]) + np.cos(b[:, None]) + np.cos(c)
-    analysis = pbdkit.analyse(scene("numpy", None).experiment)
+    analysis = pbdkit.analyse(scene("numpy", INTACT).experiment)
     assert analysis.spectral_radius == pytest.approx(np.abs(grid / 3).max(), abs=1e-12)
     assert analysis.smallest_eigenvalue == pytest.approx((grid / 3).min(), abs=1e-12)

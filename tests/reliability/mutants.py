@@ -106,6 +106,7 @@ TESTS = [
     "lattice",
     "plugin/test_lattice.py",
     "plugin/test_rule.py",
+    "plugin/test_schedule.py",
     "plugin/test_vector.py",
     "components",
     "scene",
