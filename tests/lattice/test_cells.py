@@ -9,9 +9,9 @@ from property_cases import BOTH_ENDS_HELD, LATTICES, displace, experiment, scene
 
 import pbdkit
 from pbdkit.io.snapshot import StateMoment, Tables
-from pbdkit.lattice.cells import tiling_of
+from pbdkit.lattice.cells import _is_simple, tiling_of
 from pbdkit.plugin import BasisSite, Cell, Vector
-from pbdkit.plugin.lattice import area_share
+from pbdkit.plugin.lattice import CellPolygon, Offset, area_share
 from pbdkit.stepping.state import initial_state
 
 every_lattice = pytest.mark.parametrize("lattice", LATTICES)
@@ -185,3 +185,19 @@ def test_cells_above_the_sliver_limit_belong_to_the_body(sliver):
 
     assert area(sliver) == pytest.approx(12.0 + 3.0 * sliver, abs=0.15 * sliver)
     assert area(0.015) == pytest.approx(12.0, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("corners", "expected"),
+    [
+        ([(0.0, 0.0), (1.0, 0.0), (0.3, 0.8)], True),
+        ([(0.0, 0.0), (1.0, 0.2), (1.3, 1.0), (0.3, 0.8)], True),
+        ([(0.0, 0.0), (1.0, 0.0), (0.8, 0.5), (0.2, 0.5)], False),
+        ([(0.0, 0.0), (1.0, 0.0), (1.4, 0.6), (0.5, 1.2), (-0.4, 0.6)], False),
+    ],
+    ids=["triangle", "parallelogram", "trapezium", "pentagon"],
+)
+def test_only_triangles_and_parallelograms_are_simple(corners, expected):
+    here = (0, 0)
+    offsets = (Offset(0, here, here, here, Vector(x, y)) for x, y in corners)
+    assert _is_simple(CellPolygon(0, 0, tuple(offsets))) == expected

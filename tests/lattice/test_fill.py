@@ -1,6 +1,7 @@
 """Voids narrower than two cells: cells that would connect both of their sides are left out."""
 
 import math
+from itertools import product
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 import pbdkit
+from pbdkit.lattice.raster import FRAME
 from pbdkit.scene.scene import build_scene
 from tests.mpi.test_partition import assert_built_as_cut
 
@@ -212,3 +214,16 @@ def test_particles_are_the_sites_inside_the_outline_wherever_it_lies(lattice):
     found = raster.reference(raster.body_rows)
     order, back = (np.lexsort(each.round(6).T) for each in (found, inside))
     np.testing.assert_allclose(found[order], inside[back], atol=1e-9)
+
+
+@pytest.mark.parametrize("lattice", LATTICES.values(), ids=LATTICES)
+def test_frame_consists_of_the_sites_within_its_layers(lattice):
+    body = {"type": "disc", "radius": 3.3, "centre": [0.2, 0.1]}
+    rule, frame = {"type": "barycentre"}, {"type": "mean", "layers": 2}
+    given = document(lattice, body, rule=rule, frame=frame)
+    raster = build_scene(pbdkit.Experiment(**given)).raster
+    inside = set(map(tuple, raster.site_of(raster.body_rows).tolist()))
+    points = raster.site_of(np.flatnonzero(raster.table_kind == FRAME))
+    steps = list(product(range(-2, 3), repeat=2))
+    expected = {(i + a, j + b) for i, j in inside for a, b in steps} - inside
+    assert set(map(tuple, points.tolist())) == expected

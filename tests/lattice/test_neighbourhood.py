@@ -129,6 +129,16 @@ def test_frame_maps_are_means(lattice, neighbours):
 
 @pytest.mark.parametrize("lattice", LATTICES)
 @pytest.mark.parametrize("neighbours", NEIGHBOURS)
+def test_bonds_are_stored_within_their_reach(lattice, neighbours):
+    neighbourhood = scene_of(lattice=lattice, neighbours=neighbours).neighbourhood
+    backward, forward = neighbourhood.owner_reach
+    for slot, (_, at_start) in neighbourhood.owner.items():
+        steps = zip(backward, slot.cell, forward, strict=True)
+        assert at_start or all(-low <= step <= high for low, step, high in steps)
+
+
+@pytest.mark.parametrize("lattice", LATTICES)
+@pytest.mark.parametrize("neighbours", NEIGHBOURS)
 def test_frame_points_follow_each_of_the_nearest_particles_once(lattice, neighbours):
     scene = scene_of(lattice=lattice, neighbours=neighbours, frame={"type": "mean"})
     raster, follow = scene.raster, scene.frame.map
