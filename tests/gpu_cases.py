@@ -133,7 +133,8 @@ def scenes():
     """Return the scenes by name; each has a feature that others do not have."""
     found = {name: scene_of(sheet(**SMALL | parts)) for name, parts in SHEETS.items()}
     found |= {name: scene_of(given) for name, given in OTHERS.items()}
-    return found | {"in space": test_axes.scene("numpy", 1.2)}
+    torn = {"type": "threshold", "thresholds": [1.2]}
+    return found | {"in space": test_axes.scene("numpy", torn)}
 
 
 def names(every):
