@@ -97,6 +97,12 @@ def test_cells_of_regular_lattices_are_regular(lattice):
         assert polygon.is_regular == (lattice.type in ("square", "hexagonal"))
 
 
+def test_sites_of_the_hexagonal_lattice_have_six_neighbours_at_the_distance_a():
+    for sublattice in range(2):
+        (shell,) = Coordination().shells_around(Hexagonal(a=1.3).cell(), sublattice)
+        assert [offset.length for offset in shell] == pytest.approx([1.3] * 6)
+
+
 def test_no_frame_has_no_frame_points():
     follow = NoFrame().follow(None)
     assert len(follow.point) == len(follow.body) == len(follow.weight) == 0
