@@ -225,7 +225,9 @@ class Dogbone(Body):
     """Tensile specimen along x.
 
     It has heads of the width `width`, a gauge of `gauge_length` × `gauge_width` in the middle, and
-    fillets of `radius` between heads and gauge. `origin` is the lower left corner of the specimen.
+    fillets of `radius` R between heads and gauge. With the height h of a shoulder, at most R, a
+    fillet is √(R² - (R - h)²) long; the heads have the remaining length. `origin` is the lower left
+    corner of the specimen.
     """
 
     type: Literal["dogbone"] = "dogbone"
