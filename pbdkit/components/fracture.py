@@ -552,7 +552,7 @@ class Cohesive(UsesStiffness, SoftensCells, Parting):
     unit length of the crack. The stress is the effective stress, that of the undamaged cell. The
     normal e of the crack is the direction of the largest principal stress at the bond when
     softening begins, and does not change any more. Only a crack perpendicular to it, with the
-    normal t, can open as well; the damage is then by the larger opening.
+    normal t, can open more; the damage is then by this opening.
 
     The force of the bond in the cell is reduced by the damage D = 1 - σ/κ. Here κ is the strain of
     the bond across the crack as the maximum over time: (ε - ε_t (n · t)²) / (n · e)², with the
@@ -750,8 +750,8 @@ def _of_cell(
 ) -> Any:
     """Return the damage of a bond and the normal e of its crack, in a cell under a stress.
 
-    The damage is the larger of those by the strains across the crack and across a second one, which
-    is perpendicular to it.
+    The damage is that by the strain across the crack or, if this is larger, by the strain across a
+    perpendicular crack that has opened more.
     """
     softens = (normal_x != 0.0) | (normal_y != 0.0)
     normal = _normal(stress, r)
@@ -759,8 +759,9 @@ def _of_cell(
     strain, extent = _strain(stress, r, normal, c)
     softens = softens | ((strain > c.onset_strain) & (stress.share > 0.0))
     tangent = Vector(-normal.y, normal.x)
-    cracks = [(normal, strain, extent)]
-    cracks += [(tangent, *_strain(stress, r, tangent, c, contracts=0.0))]
+    second, length_of_second = _strain(stress, r, tangent, c, contracts=0.0)
+    opens = second * length_of_second > strain * extent
+    cracks = (normal, strain, extent), (tangent, where(opens, second, 0.0), length_of_second)
     for across, strain, extent in cracks:
         flexibility = _along(across, c.along_y, c.across)
         stiffness = _along(across, c.stiff_y, c.stiff_across)
