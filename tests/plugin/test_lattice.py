@@ -16,7 +16,7 @@ from pbdkit.stepping.engine_choice import choose, make_engine
 from pbdkit.stepping.numpy_engine import Stepper
 from pbdkit.stepping.state import initial_state
 
-SIZES, STEPS = (3, 4, 5), 12
+SIZES, STEPS = (3, 6, 7), 12
 PULL, TURN = (0.11, 0.02, -0.03), (-0.02, 0.05, 0.04)
 
 

@@ -18,6 +18,8 @@ from pbdkit.plugin import Cell, Vector
 from pbdkit.scene.constants import signed_distance
 from pbdkit.scene.materials import laminate, layered
 from pbdkit.scene.scene import build_scene
+from pbdkit.stepping.numba_engine import sweeps
+from pbdkit.stepping.numba_engine.arrays import kinds_of
 from pbdkit.stepping.numba_engine.engine import CompiledStepper
 from tests.stepping.numba_engine.test_engine import assert_bitwise_equal
 
@@ -298,6 +300,22 @@ def loaded_sheet(rule: dict[str, Any], force: float) -> Any:
         "solver": {"type": "equilibrium"},
     }
     return pbdkit.run(given, progress=False)["u"].isel(time=-1).values
+
+
+def test_particles_without_cells_of_another_material_have_their_own_kernel():
+    """Particles that have all neighbours, and only cells of the material of the rule, are computed
+    without a loop over slots. The cells from 3 to 4 contain both materials."""
+    right = {"type": "rectangle", "width": 9.0, "height": 9.0, "origin": [3.5, -1.0]}
+    given = bar(8.0, 4.0) | {
+        "rule": {"type": "elastic"} | NU_BY_REGION,
+        "regions": {"right": right},
+    }
+    scene = build_scene(pbdkit.Experiment(**given))
+    block = scene.raster.body_block(0)
+    x, y = scene.raster.reference_planes(block)
+    is_whole = (x > 0.5) & (x < 2.5) & (y > 0.5) & (y < 3.5)
+    expected = np.where(is_whole, sweeps.PLAIN, sweeps.GENERAL)
+    np.testing.assert_array_equal(kinds_of(scene, block, all_general=False), expected)
 
 
 @pytest.mark.parametrize("stiffness", [4.0, "field", "course"])

@@ -418,6 +418,16 @@ def test_particles_beyond_the_reach_of_leaders_are_untouched():
     assert (state.u[0, 0, 2:36, 5] > 0).all()
 
 
+def test_motion_propagates_through_frame_points_of_distant_particles(interpreted):
+    """Frame points follow the particle in the middle, so that the edge moves one step after it."""
+    pushed = {"type": "displace", "displacement": [0.1, 0.05]}
+    leaders = [{"select": {"nearest": [[4.0, 3.0]]}, "motion": pushed}]
+    scene = build_scene(pbdkit.Experiment(**sheet(frame=Turning(), leaders=leaders)))
+    state = assert_bitwise_equal(scene, CompiledStepper(scene), calls=(1, 1))
+    block = scene.raster.body_block(0)
+    assert block.of(state.u[0])[0].all()
+
+
 FACTORS = np.array([0.5, 1.0])
 WHOLE = np.int64(1)
 
