@@ -142,6 +142,14 @@ def test_outlines_far_from_the_origin():
     assert_built_as_cut(sheet(body=body, lattice=lattice, leaders=leaders), 3)
 
 
+def test_each_frame_point_is_in_a_part():
+    given_ = sheet(body={"type": "grid", "columns": 30, "rows": 4}) | {"frame": {"type": "mean"}}
+    scene = build_scene(pbdkit.Experiment(**given_))
+    subdomains = CUTS[type(scene.experiment.solver)].subdomains(scene, 3)
+    frames = [part_of(scene, each).scene.frame for each in subdomains]
+    assert sum(len(frame.place) for frame in frames) >= len(scene.frame.place)
+
+
 def test_each_process_stores_only_its_rows():
     experiment = pbdkit.Experiment.model_validate(
         sheet(body={"type": "grid", "columns": 400, "rows": 3})
