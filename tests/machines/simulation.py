@@ -146,6 +146,9 @@ class SimulationMachine(Counted):
             return
         self.advance(count)
         assert_same(self.run.driver.state, self.model)
+        if self.run.outcome:  # recording has ended too
+            for _recording, states, _writes in self.records:
+                states[self.model.step] = self.model
 
     @precondition(lambda self: self.run)
     @rule(count=st.sampled_from([-1, 1.0, True, None]))
@@ -217,7 +220,8 @@ class SimulationMachine(Counted):
         except FloatingPointError:
             assert self.kind == "diverging"
             return
-        states[last] = self.model
+        if not was_over:
+            states[last] = self.model
         if self.kind == "diverging":
             return
         with recording.dataset as dataset:
