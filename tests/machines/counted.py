@@ -118,6 +118,15 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {name: content for name, content in data.items() if content}
 
 
+def without_counters(files: dict[str, bytes]) -> dict[str, bytes]:
+    """Return files without the numbers of changes in the headers of SQLite databases. Opening a
+    store for writing increases them."""
+    return {
+        name: data[:24] + data[28:92] + data[96:] if data.startswith(b"SQLite format 3") else data
+        for name, data in files.items()
+    }
+
+
 def put_back(folder: Path, files: dict[str, bytes]) -> None:
     """Restore the files of a folder."""
     for path in folder.rglob("*"):
