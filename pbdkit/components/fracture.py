@@ -779,8 +779,7 @@ def _normal(stress: CellStress, r: Vector) -> Vector:
     of the strains over MIN_SQUARED_COSINE, as in `_strain` for a bond along the crack.
     """
     x, y, square = r.x * r.x, r.y * r.y, squared_length(r)
-    mean = stress.strain_xx * x + stress.strain_yy * y + 2.0 * stress.strain_xy * r.x * r.y
-    more = stress.strain - mean / square
+    more = stress.strain - _mean_strain(stress, r) / square
     more = where(more > 0.0, more, 0.0) / (MIN_SQUARED_COSINE * square)
     half = 0.5 * (stress.xx - stress.yy + more * (x - y))
     xy = stress.xy + more * r.x * r.y
@@ -789,6 +788,12 @@ def _normal(stress: CellStress, r: Vector) -> Vector:
     cos = where(has_direction, half / where(has_direction, radius, 1.0), 1.0)
     along_x, along_y = np.sqrt(0.5 * (1.0 + cos)), np.sqrt(0.5 * (1.0 - cos))
     return Vector(along_x, where(xy < 0.0, -along_y, along_y))
+
+
+def _mean_strain(stress: CellStress, r: Vector) -> Any:
+    """Return the mean strain of the cell along a bond, times |r|²."""
+    x, y = r.x * r.x, r.y * r.y
+    return stress.strain_xx * x + stress.strain_yy * y + 2.0 * stress.strain_xy * r.x * r.y
 
 
 def _strain(
@@ -813,9 +818,7 @@ def _strain(
     strain_across = stress.strain_xx * xx + stress.strain_yy * yy + stress.strain_xy * xy
     strain_along = stress.strain_xx * yy + stress.strain_yy * xx - stress.strain_xy * xy
     contraction = stress_across * _along(normal, c.along_y, c.across) - strain_across
-    mean = stress.strain_xx * (r.x * r.x) + stress.strain_yy * (r.y * r.y)
-    mean = mean + 2.0 * stress.strain_xy * (r.x * r.y)
-    square, squared = squared_length(r), across * across
+    mean, square, squared = _mean_strain(stress, r), squared_length(r), across * across
     extent = where(squared > MIN_SQUARED_COSINE * square, squared, MIN_SQUARED_COSINE * square)
     own = mean - strain_along * (along * along) + contracts * contraction * squared
     more = (stress.strain * square - mean) * (squared / extent)
