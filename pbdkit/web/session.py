@@ -446,10 +446,10 @@ class Session:
         """Grab the particle of a visible row. It becomes a leader when it is moved."""
         if row >= len(self.camera.rows):
             raise ExperimentError(f"there is no particle {row}")
-        self.release()
         row_in_table = int(self.camera.rows[row])
         if self.stage.scene.raster.table_kind[row_in_table] == FRAME:
             raise ExperimentError("frame points follow the body, and cannot be moved")
+        self.release()
         self.grabbed = GrabbedParticle(row_in_table)
 
     def drag(self, by: Displacement) -> None:

@@ -381,12 +381,17 @@ def test_leaders_without_a_possible_position_stay_with_a_message(tmp_path):
     ],
 )
 def test_invalid_actions_are_refused_without_effect(command, told, tmp_path):
-    session, _ = session_of("paper/a", tmp_path)
+    """A particle that is dragged at the time is not released, either."""
+    session, equal = (session_of("paper/a", tmp_path)[0] for _ in range(2))
+    for each in (session, equal):
+        do(each, do="grab", row=67)
+        do(each, do="drag", by=[1.0, 0.0])
     with pytest.raises(pbdkit.ExperimentError, match=re.escape(told)):
         execute(session, command_of(json.dumps(command)))
-    session.advance(1)
-    fresh, _ = session_of("paper/a", tmp_path)
-    assert session.script.written(1) == fresh.script.written(1)
+    assert session.grabbed is not None
+    for each in (session, equal):
+        each.advance(2)
+    assert session.script.written(2) == equal.script.written(2)
 
 
 REFUSED = [
