@@ -21,7 +21,6 @@ from pbdkit.errors import ExperimentError
 from pbdkit.lattice.raster import EMPTY, FOLLOWER, FRAME, LEADER, slot_step
 from pbdkit.linear.block_matrix import BlockMatrix, CoordinateMatrix, frame_matrices
 from pbdkit.linear.response import by_sublattice, has_neighbours, respond
-from pbdkit.model.solver import Stepping
 from pbdkit.scene.leader_groups import kinds_at
 from pbdkit.scene.scene import Scene
 from pbdkit.stepping.followers import SlotFollowers
@@ -341,12 +340,8 @@ class _Assembly:
 
     def _load_moves(self, place: Indices) -> Floats:
         """Compute what the loads of the step add to the moves, (follower, axis)."""
-        moves = []
-        for scene in (replace(self._scene, loads=None), self._scene):
-            state = replace(self._state.copy(), step=self._step - 1)
-            SlotFollowers(scene, Stepping()).move(self._state.u, state.previous, state)
-            moves.append(state.previous.reshape(scene.axes, -1)[:, place].T)
-        return moves[1] - moves[0]
+        added = SlotFollowers(self._scene).load_moves(self._state.u, self._state, self._step)
+        return added.reshape(self._scene.axes, -1)[:, place].T
 
     def _add(self, rows: Integers, places: Indices, blocks: Floats) -> None:
         """Add blocks. Blocks of followers and leaders are added directly. Blocks of frame points

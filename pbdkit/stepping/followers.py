@@ -105,6 +105,17 @@ class SlotFollowers(Followers):
         without neighbours."""
         return self._of_all(Evaluator.move, m, state)
 
+    def load_moves(self, m: Floats, state: State, step: int) -> Floats:
+        """Return what the loads of a step add to the moves of body particles."""
+        assert self._scene.loads
+        acting, out = self._scene.loads.at(step, m.dtype), np.zeros_like(m)
+        for around, evaluator, total, values in self._summed(m, state):
+            load = vector(shown(around.where.of(acting)))
+            moves = evaluator.move(total, values, load), evaluator.move(total, values)
+            for loaded, unloaded, plane in zip(*moves, around.where.of(out), strict=True):
+                _write(plane, loaded - unloaded, around.movable, 0.0)
+        return out
+
     def forces(self, m: Floats, state: State) -> Floats:
         """Return the forces of the rule on body particles, including leaders, divided by Young's
         modulus and thickness; zero for particles without neighbours."""
