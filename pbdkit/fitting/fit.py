@@ -28,6 +28,7 @@ from pbdkit.fitting.problem import (
     hat_diagonal,
     spread_of,
     with_correlated_errors,
+    with_other_branch,
 )
 from pbdkit.fitting.specimens import FittedSpecimens, combine_specimens
 from pbdkit.fitting.uncertainty import (
@@ -326,15 +327,20 @@ def _refuse_underdetermined(problem: Problem) -> None:
 def _solve(problem: Problem, fit: Fit) -> tuple[Problem, Solution]:
     """Solve the problem. Noise that is not given is estimated from the residuals.
 
-    The standard errors account for correlated residuals.
+    Standard errors account for another branch of the predictions and for correlated residuals.
     """
+    problem, solution = _minimum(problem, fit)
+    solution = with_other_branch(problem, solution, fit.loss)
+    return problem, with_correlated_errors(problem, solution, fit.loss)
+
+
+def _minimum(problem: Problem, fit: Fit) -> tuple[Problem, Solution]:
+    """Return the problem with the noise of each measurement, and its solution."""
     unknown = [n for n, measurement in enumerate(fit.measured) if measurement.noise is None]
     if not unknown:
-        problem, solution = solve(problem, problem.start(), fit.loss)
-        return problem, with_correlated_errors(problem, solution, fit.loss)
+        return solve(problem, problem.start(), fit.loss)
     if len(problem.observations) > 1:
-        problem, solution = _solve_for_noises(problem, fit, unknown)
-        return problem, with_correlated_errors(problem, solution, fit.loss)
+        return _solve_for_noises(problem, fit, unknown)
     (observation,) = problem.observations
     problem = replace(
         problem, observations=(observation.with_noise(TINY * _size(observation.measured)),)
@@ -350,7 +356,7 @@ def _solve(problem: Problem, fit: Fit) -> tuple[Problem, Solution]:
             problem, observations=(observation.with_noise(ratio * observation.noise),)
         )
         problem, solution = solve(problem, solution.z, fit.loss)
-    return problem, with_correlated_errors(problem, solution, fit.loss)
+    return problem, solution
 
 
 def _solve_for_noises(

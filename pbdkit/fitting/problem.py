@@ -1018,11 +1018,8 @@ def _principal_axes(product: Floats, sizes: Floats) -> tuple[Floats, Floats]:
 def with_correlated_errors(problem: Problem, solution: Solution, loss: Loss) -> Solution:
     """Return the solution with standard errors that account for correlations of the residuals.
 
-    They do not change if no correlation is significant. If predictions are not smooth, standard
-    errors also account for another branch.
+    They do not change if no correlation is significant.
     """
-    if not problem.is_smooth:
-        solution = _with_other_branch(problem, solution, loss)
     at = solution.at
     size = np.linalg.norm(at.jacobian, axis=0)
     basis, *_ = _singular(at.jacobian / np.where(size > 0.0, size, 1.0))
@@ -1052,15 +1049,17 @@ def with_correlated_errors(problem: Problem, solution: Solution, loss: Loss) -> 
     )
 
 
-def _with_other_branch(problem: Problem, solution: Solution, loss: Loss) -> Solution:
+def with_other_branch(problem: Problem, solution: Solution, loss: Loss) -> Solution:
     """Return the solution with standard errors that account for another branch of the predictions.
 
-    Each parameter is changed by its standard error in both directions. If the predictions jump in
-    between, the minimum on the branch there is computed with the derivatives at the solution. With
-    its distance d and its cost χ², the covariance C becomes C + w d dᵀ, where w is the likelihood
-    exp(-χ² / 2) divided by the sum of the likelihoods of both minima. The largest such change is
-    used.
+    They do not change if the predictions are smooth. Otherwise each parameter is changed by its
+    standard error in both directions. If the predictions jump in between, the minimum on the branch
+    there is computed with the derivatives at the solution. With its distance d and its cost χ², the
+    covariance C becomes C + w d dᵀ, where w is the likelihood exp(-χ² / 2) divided by the sum of
+    the likelihoods of both minima. The largest such change is used.
     """
+    if problem.is_smooth:
+        return solution
     at, (low, high), count = solution.at, problem.bounds(), len(problem.unknowns)
     cost, rise = cost_of(at.residuals, loss), rise_of_loss(at.residuals, problem.size, loss)
     branch = np.zeros(problem.size)

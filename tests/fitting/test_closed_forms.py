@@ -458,12 +458,11 @@ def test_errors_contain_another_branch(jump: float) -> None:
         at=lambda z, near, is_exact=False: Linearisation(z, residuals(z), J, (prediction,)),
         residuals=residuals,
         bounds=lambda: (-free, free),
-        rows=list,
     )
     solution = problem.solved(stub, np.zeros(1))
     variance = max(1.0, r @ r / 8) / 9
     np.testing.assert_allclose(solution.covariance, variance)
-    solution = problem.with_correlated_errors(stub, solution, "linear")
+    solution = problem.with_other_branch(stub, solution, "linear")
     np.testing.assert_allclose(solution.covariance, variance + jump**2 / 2)
 
 
