@@ -9,6 +9,7 @@ from hypothesis import given, strategies as st
 from scene_strategies import samples
 
 import pbdkit
+from pbdkit.components.elasticity import Elastic
 from pbdkit.lattice.raster import FRAME, LEADER
 from pbdkit.scene.scene import build_scene
 
@@ -121,6 +122,22 @@ def test_poisson_ratio_of_minus_one_gives_the_barycentre():
     elastic = steps_of({"type": "elastic", "poisson_ratio": -1.0})
     four = steps_of({"type": "barycentre"}, neighbours={"type": "coordination", "shells": 1})
     np.testing.assert_allclose(elastic, four, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("nu", [-0.5, 0.0, 0.3, 0.45])
+def test_stiffness_follows_from_the_law_of_hooke_in_space(nu):
+    """The strain across the plane is zero in plane strain, and the stress in plane stress."""
+    compliance = np.diag([1.0, 1.0, 1.0, 2 * (1 + nu)])  # of xx, yy, zz and xy
+    compliance[:3, :3] -= nu * (1.0 - np.eye(3))
+    in_plane = np.ix_([0, 1, 3], [0, 1, 3])
+    exact = {
+        "strain": np.linalg.inv(compliance)[in_plane],
+        "stress": np.linalg.inv(compliance[in_plane]),
+    }
+    for plane, matrix in exact.items():
+        c = Elastic(poisson_ratio=nu, plane=plane).elasticity()
+        found = [[c.xx, c.xy, 0.0], [c.xy, c.yy, 0.0], [0.0, 0.0, c.shear]]
+        np.testing.assert_allclose(found, matrix, rtol=1e-12)
 
 
 def test_orthotropic_with_the_ratios_of_an_isotropic_material_is_elastic():

@@ -80,6 +80,16 @@ def test_springs_of_rectangles_are_as_stiff_as_the_cell_permits(a: float, b: flo
         assert min(rest, hourglass) < 1e-9
 
 
+@pytest.mark.parametrize("nu", [0.0, 0.2, 1 / 3])
+def test_remainder_of_isotropic_squares_is_a_pure_shear_stiffness(nu: float) -> None:
+    """An edge beside a straight cut has the stiffness 1/(2(1 + ν))."""
+    cells, bonds, area = rectangle(1.0, 1.0)
+    springs = constants(bonds, isotropic(nu), cells)
+    remainder = matrix(isotropic(nu)) - of_springs(bonds, springs, area)
+    np.testing.assert_allclose(springs[:4], 1 / (2 * (1 + nu)), rtol=1e-12)
+    np.testing.assert_allclose(remainder[:2], 0.0, atol=1e-12)
+
+
 @pytest.mark.parametrize("a", [1.0, 0.7])
 def test_springs_of_triangles_are_as_stiff_as_the_cell_permits(a: float) -> None:
     """With Poisson's ratio 1/3 they are the cell."""
