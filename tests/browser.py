@@ -69,7 +69,7 @@ def until(holds: Callable[[], Any], seconds: float = 20.0) -> None:
     deadline = time.monotonic() + seconds
     while not holds():
         assert time.monotonic() < deadline, "it never came to that"
-        time.sleep(0.01)
+        time.sleep(0.03)
 
 
 def until_page(page: Any, expression: str) -> None:

@@ -10,13 +10,11 @@ import subprocess
 import sys
 import tomllib
 from collections.abc import Callable
-from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import jsonschema
 import pytest
-from interpreted_kernels import interpreting
 from plugin_sources import listed
 from scene_strategies import in_turn
 
@@ -75,11 +73,15 @@ def test_bonds_break_in_the_example_of_a_fracture_model(new: New) -> None:
 
 
 @pytest.mark.parametrize("interface", in_turn(OFFERED, 2))
-def test_project_passes_conformance(new: New, interface: str) -> None:
+def test_project_passes_conformance(
+    new: New, interface: str, request: pytest.FixtureRequest
+) -> None:
+    """Rules are compiled; in the profile `long`, all components."""
+    if interface != "FollowerRule":
+        request.getfixturevalue("compiled_at_length")
     new("pbdkit-brand-new", interface)
     kind = next(i for i in INTERFACES.values() if i.__name__ == interface)
-    with nullcontext() if interface in ("FollowerRule", "FractureModel") else interpreting():
-        report = examine(Registry().find(kind, "brand-new")())
+    report = examine(Registry().find(kind, "brand-new")())
     assert report.holds, str(report)
 
 
@@ -135,33 +137,28 @@ def test_rule_is_the_barycentre_and_one_line_changes_it(
     assert float(abs(moved[0] - moved[1]).max()) < 1e-12
 
 
-def test_three_commands_lead_to_the_first_run(tmp_path: Path, interpreted: None) -> None:
-    """The three that the first one prints; installed beside the other packages."""
+def test_three_commands_lead_to_the_first_run(call: Call, interpreted: None) -> None:
+    """The first one prints the other two; the project is installed beside the other packages."""
     pytest.importorskip("hatchling")
-    site = tmp_path / "site"
+    site = Path("site").absolute()
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(site), *sys.path])}
 
-    def call(*words: str) -> str:
-        done = subprocess.run(
-            [sys.executable, "-m", *words],
-            cwd=tmp_path,
-            env=environment,
-            capture_output=True,
-            text=True,
-        )
+    def run(*words: str) -> str:
+        command = [sys.executable, "-m", *words]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True)
         assert done.returncode == 0, done.stdout + done.stderr
         return done.stdout
 
-    said = call("pbdkit", "plugins", "new", "pbdkit-mine").splitlines()
+    said = call("plugins", "new", "pbdkit-mine").out.splitlines()
     assert said[1:] == ["  pip install -e ./pbdkit-mine", "  pbdkit run pbdkit-mine/example.yaml"]
     offline = ["--no-build-isolation", "--no-deps", "--no-index", "--target", "site"]
-    call(*said[1].split(), *offline)
+    run(*said[1].split(), *offline)
     (link,) = site.glob("*.pth")
     editable = link.read_text().strip()
     environment["PYTHONPATH"] += os.pathsep + editable  # a .pth counts in site-packages only
-    assert editable == str(tmp_path / "pbdkit-mine")
-    assert "complete: " in call(*said[2].split())
-    assert " passed" in call("pytest", "-p", "no:cacheprovider", "pbdkit-mine")
+    assert editable == str(Path("pbdkit-mine").absolute())
+    assert "complete: " in run(*said[2].split())
+    assert " passed" in run("pytest", "-p", "no:cacheprovider", "pbdkit-mine")
 
 
 REFUSED = {

@@ -97,7 +97,7 @@ REFUSED = ["no position", "positions not finite", "bonds of nobody", "no JSON", 
 
 
 @pytest.mark.usefixtures("read_once")
-@pytest.mark.parametrize("name", in_turn(CRAFTED, 2))
+@pytest.mark.parametrize("name", in_turn(CRAFTED, 3))
 def test_crafted_file_is_plotted_or_refused_in_one_line(name: str, sound: Path, call: Call) -> None:
     shutil.copy(sound, "crafted.nc")
     with netCDF4.Dataset("crafted.nc", "a") as file:

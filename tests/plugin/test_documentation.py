@@ -10,12 +10,10 @@ import subprocess
 import sys
 import types
 import zlib
-from contextlib import nullcontext
 from pathlib import Path
 from typing import ClassVar, get_origin
 
 import pytest
-from interpreted_kernels import interpreting
 
 import pbdkit
 import pbdkit.testing
@@ -121,12 +119,11 @@ def reports_on(interface, code, tmp_path, monkeypatch):
 
 
 @EVERY
-def test_smallest_example_passes_conformance(interface, tmp_path, monkeypatch):
+def test_smallest_example_passes_conformance(interface, tmp_path, monkeypatch, compiled_at_length):
+    """`cli/test_plugins_new` compiles a rule, and `testing/test_conformance` all built-in ones."""
     code = blocks(text_of(interface))[0]
     has_functions = interface in (pbdkit.FollowerRule, pbdkit.FractureModel)
-    with nullcontext() if has_functions else interpreting():
-        reports = reports_on(interface, code, tmp_path, monkeypatch)
-    for report in reports:
+    for report in reports_on(interface, code, tmp_path, monkeypatch):
         assert report.holds, str(report)
         if has_functions:
             assert "is-the-same-compiled" in [outcome.property for outcome in report.ran]

@@ -86,8 +86,8 @@ def scene(engine, fracture, *, moves=True):
 @pytest.mark.parametrize("engine", ["numpy", "compiled"])
 @pytest.mark.parametrize("threshold", [None, 1.2])
 def test_cubic_lattice_steps_like_plain_loops(engine, threshold, request):
-    if threshold is None:  # what tears is compiled
-        request.getfixturevalue("interpreted")
+    if threshold is not None:
+        request.getfixturevalue("compiled_at_length")
     torn = {"type": "threshold", "thresholds": [threshold]}
     block = scene(engine, INTACT if threshold is None else torn)
     left, right, _ = faces()

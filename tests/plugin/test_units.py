@@ -354,7 +354,8 @@ def test_check_prints_forces_as_in_the_file(call: Any) -> None:
         "{select: {edge: right}, force: [20 N, 0.0]}": "force [20, 0] N",
         "{select: {edge: right}, body_force: [0.0, -0.5 N/mm^2]}": "body force [0, -0.5] N/mm²",
     }.items():
-        assert told in call("check", "modelling/composite-plate", "--set", f"loads.0={load}").out
+        settings = ["--set", f"loads.0={load}", "--set", "units.length=4 mm"]
+        assert told in call("check", "modelling/composite-plate", *settings).out
 
 
 def test_distance_from_equilibrium_is_printed_in_mm(call: Any) -> None:
