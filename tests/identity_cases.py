@@ -1,9 +1,11 @@
 """Lattices, neighbours and rules, of third parties too, that the tests of identity share."""
 
 import math
+from dataclasses import replace
 from typing import Any, ClassVar, Literal
 
 import pbdkit
+from pbdkit.components.lattices import Hexagonal
 from pbdkit.plugin import BasisSite, Cell, Vector
 
 SQUARE = {"type": "square", "a": 1.0}
@@ -57,6 +59,17 @@ class Honeycomb(pbdkit.Lattice):
             period=(2, 1),
             primitive=((2, 0), (0, 1)),
         )
+
+
+class Displaced(pbdkit.Lattice):
+    """The hexagonal lattice with cells that have no site at their corners."""
+
+    type: Literal["displaced"] = "displaced"
+
+    def cell(self):
+        cell = Hexagonal(a=1.0).cell()
+        sites = [replace(site, at=site.at + Vector(0.2, 0.1)) for site in cell.sites]
+        return replace(cell, sites=tuple(sites))
 
 
 class Mean(pbdkit.FollowerRule):
@@ -217,7 +230,7 @@ def subclasses(of: type) -> list[type]:
     return [kind for one in of.__subclasses__() for kind in (one, *subclasses(one))]
 
 
-THIRD_PARTY = [IndexSteps, Honeycomb, *subclasses(Mean)]
+THIRD_PARTY = [IndexSteps, Honeycomb, Displaced, *subclasses(Mean)]
 
 
 def experiment(lattice: Any, neighbours: Any, rule: Any, **parts: Any) -> dict[str, Any]:

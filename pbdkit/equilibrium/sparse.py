@@ -300,7 +300,7 @@ class SingularSubsystem(Subsystem):
             np.zeros(self._borders) if invariant_change is None else self._left.T @ invariant_change
         )
         x = self._solver.solve(np.concatenate([r - push, invariants]), ACCURACY)[: self._size]
-        terms = abs(self._matrix) @ np.abs(x) + np.abs(r)
+        terms = abs(self._matrix) @ np.abs(x)
         large = NOTHING * float(terms.max(initial=0.0)) + 8.0 * rounding
         if not np.abs(push).max(initial=0.0) <= large:
             raise UnbalancedLoadError

@@ -60,10 +60,10 @@ def test_equal_springs_are_isotropic_on_triangles_and_not_on_squares():
     assert squares.body.zener == pytest.approx(2.0)
 
 
-def test_larger_cell_changes_nothing():
+@pytest.mark.parametrize("lattice", [{"type": "hexagonal", "a": 1.0}, {"type": "displaced"}])
+def test_larger_cell_changes_nothing(lattice):
     two_sites, one_site = (
-        identity(lattice, NEAREST, WEIGHTED)
-        for lattice in ({"type": "hexagonal", "a": 1.0}, oblique(60.0))
+        identity(lattice, NEAREST, WEIGHTED) for lattice in (lattice, oblique(60.0))
     )
     assert (two_sites.stencil.sites, one_site.stencil.sites) == (1, 1)
     np.testing.assert_allclose(two_sites.long.second, one_site.long.second, atol=1e-12)

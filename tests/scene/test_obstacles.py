@@ -380,6 +380,16 @@ def test_future_obstacle_may_lie_in_the_body() -> None:
     assert closest[5] < 2.5
 
 
+@pytest.mark.parametrize("normal", [(1.0, 0.0), (0.0, -1.0)])
+def test_an_obstacle_farther_away_than_the_size_of_the_body_gives_a_warning(normal: Any) -> None:
+    corners = np.array([[0.0, 0.0], [14.0, 8.0]])
+    near = (corners @ normal).min() - np.hypot(14.0, 8.0)
+    for distance, count in ((0.1, 1), (-0.1, 0)):
+        at = (near - distance) * np.array(normal)
+        scene = build_scene(pbdkit.Experiment(**block(obstacles=[plane(at.tolist(), normal)])))
+        assert sum("remains farther from the body" in text for text in scene.warnings) == count
+
+
 MESSAGES: dict[str, tuple[dict[str, Any], str]] = {
     "grid": (
         {"shape": {"type": "grid", "columns": 2, "rows": 2}},

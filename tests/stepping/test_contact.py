@@ -530,3 +530,19 @@ def test_guided_particles_are_pushed_along_their_free_axis_only(axes: Any) -> No
     w = Contact(scene).corrections(np.zeros((2, *scene.raster.shape)), place, 2)
     for axis, name in enumerate("xy"):
         assert w[axis].any() == (name not in axes)
+
+
+@pytest.mark.parametrize("is_guided", [False, True])
+def test_particles_slide_along_a_face_parallel_to_their_guide(is_guided: bool) -> None:
+    guided = {"select": {"edge": "bottom"}, **displaced(0.0, 0.0), "axes": ["y"]}
+    floor = plane([0.0, 0.0], [0.0, 1.0])
+    given = block(leaders=[guided] if is_guided else [], obstacles=[floor])
+    scene = build_scene(pbdkit.Experiment(**given))
+    u = np.zeros((2, *scene.raster.shape))
+    place = scene.raster.place_of(scene.raster.body_rows)
+    place = place[Contact(scene).positions(u, place)[1] == 0.0]
+    faces, turned = hold(Contact(scene), scene, u, place, 1.0)
+    assert (turned[:, :, 0] == [1.0, 0.0]).all()
+    assert (turned[:, 1] == 0.0).all()
+    assert (faces[:, 0] == (NO_FACE if is_guided else 0)).all()
+    assert len(faces) == 15

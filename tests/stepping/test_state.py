@@ -13,7 +13,7 @@ import pbdkit
 from pbdkit.scene.scene import build_scene
 from pbdkit.seeds import component_generator
 from pbdkit.stepping.numpy_engine import Stepper
-from pbdkit.stepping.state import initial_state
+from pbdkit.stepping.state import cut_bonds, initial_state
 
 PARTS = [Weakest, Tiring]
 LEFT = {"select": {"edge": "left"}, "motion": {"type": "hold"}}
@@ -214,8 +214,11 @@ def test_operator_of_a_softened_state_equals_the_step():
     np.testing.assert_allclose(predicted, moved, rtol=0, atol=1e-13)
 
 
-def test_only_cuts_at_step_0_are_part_of_the_initial_state():
-    cuts = [{"from": [x, -1.0], "to": [x, 1.0], "at": at} for x, at in ((1.5, 0), (3.5, 1))]
-    given = chain(5, fracture={"type": "none"}, cuts=cuts)
-    state = initial_state(build_scene(pbdkit.Experiment(**given)))
-    assert state.broken_step[state.broken_step >= 0].tolist() == [0]
+def test_cuts_break_intact_bonds_at_their_step():
+    places = ((1.5, 0), (3.5, 1), (1.5, 1))
+    cuts = [{"from": [x, -1.0], "to": [x, 1.0], "at": at} for x, at in places]
+    scene = build_scene(pbdkit.Experiment(**chain(5, fracture={"type": "none"}, cuts=cuts)))
+    broken = initial_state(scene).broken_step
+    assert broken[broken >= 0].tolist() == [0]
+    assert cut_bonds(scene, broken, 1)
+    assert sorted(broken[broken >= 0].tolist()) == [0, 1]
