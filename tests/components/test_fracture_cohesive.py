@@ -420,6 +420,17 @@ def test_cells_begin_to_soften_one_after_the_other():
     assert counts[0] < counts[1] < counts[2] == counts[3] < counts[4]
 
 
+def test_cells_that_do_not_begin_to_soften_need_not_wait():
+    """Only the last cell is strained, and its damage increases."""
+    given = Strained(rule=ELASTIC, body={"type": "grid", "columns": 6, "rows": 2})
+    u = given.X * (given.X[:, :1] == given.X[:, 0].max()) * [0.0, 1.0]
+    damage = [0.0]
+    for strain in (3.0 * ONSET, 4.0 * ONSET):
+        assert not given.put(strain * u, in_turn=True)
+        damage.append(sum(value.sum() for value in given.state.bond_values[:2]))
+    assert damage[0] < damage[1] < damage[2]
+
+
 TORN = {
     "body": {"type": "grid", "columns": 6, "rows": 6},
     "cuts": [{"from": [-1.0, 2.5], "to": [2.2, 2.5], "at": 10}],
