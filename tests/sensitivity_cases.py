@@ -10,6 +10,7 @@ import copy
 from dataclasses import replace
 
 import numpy as np
+from scene_strategies import AT_LENGTH
 
 import pbdkit
 from pbdkit.equilibrium.system import Moves, one_thread
@@ -137,9 +138,12 @@ def other_case(frame, parts):
 
 def paths_of(rule, frame):
     """Return all parameters with one frame; with others some of the rule, which act on the frame
-    too."""
+    too. Rules that differ from `elastic` or `springs` in the plane or the lattice have the first
+    and the last parameter, and all of them in the profile `long`."""
     paths = RULES[rule][2]
-    return paths if frame == full_frame(rule) else paths[: max(1, len(paths) - 3)]
+    if frame != full_frame(rule):
+        return paths[: max(1, len(paths) - 3)]
+    return paths if AT_LENGTH or "," not in rule else (paths[0], paths[-1])
 
 
 def full_frame(rule):

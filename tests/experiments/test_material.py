@@ -56,6 +56,7 @@ def test_copying_frame_gives_another_solution(name, off):
 
 
 def test_worked_example_recovers_the_modulus():
+    """On the finest lattice in the profile `long`."""
     (given,) = re.findall(r"^```yaml\n(.*?)^```", PAGE.read_text(), re.M | re.S)
     experiment = pbdkit.Experiment.build(read_text(given, PAGE.name))
     ds = pbdkit.run(experiment, progress=False)
@@ -65,7 +66,7 @@ def test_worked_example_recovers_the_modulus():
     assert strain[-1] == pytest.approx(9.19e-4, abs=1e-6)
     assert float(ds.reaction[-1, 1, 0]) == pytest.approx(4595, abs=1)
     straight = experiment.model_dump() | {"solver": {"type": "equilibrium"}}
-    for a, modulus in ((4.0, 209927), (2.0, 209883), (1.0, 209895)):
+    for a, modulus in ((4.0, 209927), (2.0, 209883), (1.0, 209895))[: 3 if AT_LENGTH else 2]:
         straight["lattice"] = {"type": "square", "a": a}
         ds = pbdkit.run(straight, progress=False)
         found = float(ds.nominal_stress[-1] / ds.nominal_strain[-1])

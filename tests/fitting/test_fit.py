@@ -41,7 +41,7 @@ def plate(rule=None, *, noise=0.0, generator=None, **more):
         leaders.append({"select": {"edge": edge}, "motion": {"type": "measured", **motion}})
     return {
         "name": "plate",
-        "lattice": {"type": "square", "a": 1.0},
+        "lattice": {"type": "square", "a": 2.0},
         "body": {
             "type": "difference",
             "of": [
@@ -129,7 +129,7 @@ def test_force_identifies_youngs_modulus(tmp_path):
 
 def test_force_noise_enters_the_error_of_youngs_modulus(tmp_path):
     """E is F over what the group carries at E = 1: their relative errors add as squares."""
-    made = plate(lattice={"type": "square", "a": 2.0})
+    made = plate()
     measured(made, tmp_path / "field.csv", noise=NOISE)
     unknown = {"rule.poisson_ratio": [0.0, 0.49]}
     given = {"file": str(tmp_path / "field.csv"), "noise": NOISE}
@@ -155,14 +155,13 @@ def test_errors_match_repeated_experiments():
     from pbdkit.fitting.parameter import Parameter
     from pbdkit.fitting.problem import Problem, Unknown, solved
 
-    coarse = {"lattice": {"type": "square", "a": 2.0}}
-    resting = RestingScene.of(pbdkit.Experiment(**plate(**coarse)))
+    resting = RestingScene.of(pbdkit.Experiment(**plate()))
     points = generator.uniform([0.0, 0.0], [WIDTH, HEIGHT], (600, 2))
     inside = Interpolation.at(resting.scene, points)
     points, true = points[inside.inside], inside.of(resting.state.u, resting.scene)
     off = []
     for _ in range(8):
-        noisy = pbdkit.Experiment(**plate(noise=NOISE, generator=generator, **coarse))
+        noisy = pbdkit.Experiment(**plate(noise=NOISE, generator=generator))
         scene = build_scene(noisy)
         field = true + NOISE * generator.normal(size=true.shape)
         evidence = FieldEvidence.of(scene, points, field)
@@ -231,7 +230,6 @@ def in_series(**more):
         plate(rule)
         | {
             "body": {"type": "rectangle", "width": WIDTH, "height": HEIGHT},
-            "lattice": {"type": "square", "a": 2.0},
             "leaders": [
                 {"select": {"edge": "left"}, "motion": {"type": "hold"}},
                 {"select": {"edge": "right"}, "motion": drawn},
@@ -316,7 +314,7 @@ def test_single_unidentifiable_parameter_gives_no_combination(tmp_path):
 def test_bounds_of_an_unidentified_parameter_do_not_hide_youngs_modulus(bounds, tmp_path):
     """60 points determine E to 1 %, and Poisson's ratio to 0.02, which exceeds a quarter of one of
     the intervals. One interval does not contain the true value, 0.3: its end is no criterion."""
-    made, path = plate(lattice={"type": "square", "a": 2.0}), tmp_path / "field.csv"
+    made, path = plate(), tmp_path / "field.csv"
     measured(made, path, noise=NOISE, count=60)
     given = {"file": str(path), "noise": NOISE}
     fit = {"experiment": made, "unknown": {"rule.poisson_ratio": bounds}, "measured": given}
@@ -328,35 +326,32 @@ def test_bounds_of_an_unidentified_parameter_do_not_hide_youngs_modulus(bounds, 
     assert young.error == pytest.approx(0.01 * young.value, rel=0.1)
 
 
-@pytest.mark.parametrize("bounds", [[0.0, 0.1], [0.4, 0.49], [0.0, 0.49]])
-def test_bounds_that_exclude_the_minimum_are_named(bounds, tmp_path):
+def test_bounds_that_exclude_the_minimum_are_named(tmp_path):
     """The distance of the minimum, 0.3, beyond the bound is the one that wide bounds give."""
-    made, path = plate(lattice={"type": "square", "a": 2.0}), tmp_path / "field.csv"
+    made, path = plate(), tmp_path / "field.csv"
     measured(made, path, noise=NOISE)
-    found = fitted_between(made, path, bounds)
-    texts = [text for text in found.warnings if text.startswith("unknown.rule.poisson_ratio: ")]
-    if bounds == [0.0, 0.49]:
-        assert not texts
-        assert not found.beyond_bounds
-        return
-    bound = min(bounds, key=lambda value: abs(value - 0.3))
-    (text,) = texts
-    assert f"stops at the bound {bound}" in text
-    assert "widen this bound" in text
-    wide = fitted_between(made, path, [0.0, 0.49]).values["rule.poisson_ratio"]
-    distance = abs(wide.value - bound) / found.solution.errors[0]
-    assert found.beyond_bounds["rule.poisson_ratio"] == pytest.approx(distance, rel=0.3)
 
+    def fitted_between(*bounds):
+        given = {"file": str(path), "noise": NOISE}
+        fit = {"experiment": made, "unknown": {"rule.poisson_ratio": bounds}, "measured": given}
+        found = pbdkit.fit(fit | {"modes": 3})
+        start = "unknown.rule.poisson_ratio: "
+        return found, [text for text in found.warnings if text.startswith(start)]
 
-def fitted_between(made, path, bounds):
-    given = {"file": str(path), "noise": NOISE}
-    fit = {"experiment": made, "unknown": {"rule.poisson_ratio": bounds}, "measured": given}
-    return pbdkit.fit(fit | {"modes": 3})
+    wide, texts = fitted_between(0.0, 0.49)
+    assert not texts
+    assert not wide.beyond_bounds
+    for bounds, bound in (((0.0, 0.1), 0.1), ((0.4, 0.49), 0.4)):
+        found, (text,) = fitted_between(*bounds)
+        assert f"stops at the bound {bound}" in text
+        assert "widen this bound" in text
+        distance = abs(wide.values["rule.poisson_ratio"].value - bound) / found.solution.errors[0]
+        assert found.beyond_bounds["rule.poisson_ratio"] == pytest.approx(distance, rel=0.3), bound
 
 
 @pytest.mark.parametrize(("stated", "warned"), [(NOISE, False), (NOISE / 4.0, True)])
 def test_residuals_well_above_the_noise_are_reported(stated, warned, tmp_path):
-    made, path = plate(lattice={"type": "square", "a": 2.0}), tmp_path / "field.csv"
+    made, path = plate(), tmp_path / "field.csv"
     measured(made, path, noise=NOISE, count=100)
     given = {"file": str(path), "noise": stated}
     fit = {"experiment": made, "unknown": {"rule.poisson_ratio": [0.0, 0.49]}, "measured": given}
@@ -374,7 +369,7 @@ def test_residuals_well_above_the_noise_are_reported(stated, warned, tmp_path):
 
 
 def test_robust_loss_downweights_outliers(tmp_path):
-    made, path = plate(), tmp_path / "field.csv"
+    made, path = plate(lattice={"type": "square", "a": 1.0}), tmp_path / "field.csv"
     measured(made, path, noise=NOISE)
     with path.open() as file:
         rows = list(csv.reader(file))
@@ -395,7 +390,7 @@ def test_robust_loss_downweights_outliers(tmp_path):
 
 
 def test_without_given_noise_it_is_estimated_from_residuals(tmp_path):
-    made = plate(lattice={"type": "square", "a": 2.0})
+    made = plate()
     measured(made, tmp_path / "field.csv", noise=NOISE)
     found = pbdkit.fit(
         {
@@ -512,7 +507,7 @@ def test_plot_has_one_row_per_axis_without_overlapping_text(tmp_path):
     pytest.importorskip("matplotlib")
     from pbdkit.plotting.fit_figures import draw_fit
 
-    made = plate(lattice={"type": "square", "a": 2.0})
+    made = plate()
     measured(made, tmp_path / "field.csv", noise=NOISE)
     found = pbdkit.fit(
         {

@@ -14,16 +14,15 @@ from pbdkit.fitting.problem import rise_of_loss
 from pbdkit.fitting.uncertainty import _marginal
 from tests.fitting.test_fit import NOISE, fitted, in_series, measured, plate
 
-COARSE = {"lattice": {"type": "square", "a": 2.0}}
 POISSON = {"rule.poisson_ratio": [0.0, 0.49]}
 
 
 @pytest.fixture(scope="module")
 def fit(tmp_path_factory):
     path = tmp_path_factory.mktemp("fit") / "field.csv"
-    measured(plate(**COARSE), path, noise=NOISE)
+    measured(plate(), path, noise=NOISE)
     given = {"file": str(path), "noise": NOISE}
-    return {"experiment": plate(**COARSE), "unknown": POISSON, "measured": given, "modes": 3}
+    return {"experiment": plate(), "unknown": POISSON, "measured": given, "modes": 3}
 
 
 def test_linear_profile_agrees_with_the_standard_error(fit):
@@ -72,7 +71,7 @@ def test_profile_with_two_parameters_refits_the_other(fit):
     """The profile of one of two correlated parameters is wider than a cut through the valley."""
     rule = {"type": "elastic", "poisson_ratio": 0.3, "stiffness": {"otherwise": 1.0, "half": 1.0}}
     unknown = {"rule.poisson_ratio": [0.0, 0.49], "rule.stiffness.half": [0.3, 3.0]}
-    given = fit | {"experiment": plate(rule, **COARSE), "unknown": unknown}
+    given = fit | {"experiment": plate(rule), "unknown": unknown}
     found = pbdkit.fit(given | {"profile": ["rule.stiffness.half"]})
     estimate, profile = found.values["rule.stiffness.half"], found.profiles["rule.stiffness.half"]
     assert profile.high - profile.low == pytest.approx(3.92 * estimate.error, rel=0.05)
@@ -89,7 +88,7 @@ def test_identified_ratio_transfers_bounds_between_its_parts(tmp_path):
 
 def test_unidentified_parameters_have_unbounded_intervals(fit):
     rule = {"type": "elastic", "poisson_ratio": 0.3, "stiffness": 1.0}
-    given = fit | {"experiment": plate(rule, **COARSE), "unknown": {"rule.stiffness": [0.5, 2.0]}}
+    given = fit | {"experiment": plate(rule), "unknown": {"rule.stiffness": [0.5, 2.0]}}
     profile = pbdkit.fit(given | {"profile": ["rule.stiffness"]}).profiles["rule.stiffness"]
     assert (profile.low, profile.high) == (None, None)
     assert "from no bound to no bound" in str(profile)
@@ -143,9 +142,9 @@ def test_repeating_an_observation_leaves_the_posterior_unchanged(fit):
 
 def test_sampler_draws_from_the_posterior(fit):
     pytest.importorskip("emcee")
-    found = pbdkit.fit(fit | {"sampler": {"walkers": 8, "steps": 24}})
+    found = pbdkit.fit(fit | {"sampler": {"walkers": 8, "steps": 16}})
     estimate, sample = found.values["rule.poisson_ratio"], found.sample
-    assert sample.draws.shape == (8 * 18, 1)
+    assert sample.draws.shape == (8 * 12, 1)
     assert 0.2 < sample.acceptance < 0.95
     assert abs(sample.mean[0] - estimate.value) < estimate.error
     assert 0.0 < sample.error[0] < estimate.error
@@ -165,11 +164,11 @@ def test_missing_sampler_is_named_before_the_fit(fit, monkeypatch):
 def test_correct_model_predicts_best(tmp_path):
     """The isotropic rule predicts left-out points of an orthotropic plate worse."""
     rule = {"type": "orthotropic", "poisson_ratio": 0.2, "modulus_ratio": 0.5, "shear_ratio": 0.3}
-    made = plate(rule, **COARSE)
+    made = plate(rule)
     measured(made, tmp_path / "field.csv", noise=NOISE / 4)
     found = pbdkit.fit(
         {
-            "experiment": plate(**COARSE),
+            "experiment": plate(),
             "unknown": POISSON,
             "measured": {"file": str(tmp_path / "field.csv"), "noise": NOISE / 4},
             "modes": 3,
@@ -217,7 +216,7 @@ def test_third_party_rule_is_a_candidate(fit):
     found = pbdkit.fit(fit | {"candidates": {"lazy": rival}, "folds": 2}, components=[Lazy])
     assert [candidate.name for candidate in found.candidates] == ["as given", "lazy"]
     own = pbdkit.fit(
-        fit | {"experiment": plate(settings["rule"], **COARSE) | {"frame": {"type": "mean"}}}
+        fit | {"experiment": plate(settings["rule"]) | {"frame": {"type": "mean"}}}
         | {"unknown": rival["unknown"]},
         components=[Lazy],
     )  # fmt: skip

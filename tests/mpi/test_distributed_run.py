@@ -104,13 +104,13 @@ def still_neighbours(given_):
     return given_["neighbours"].get("reevaluate") is not True
 
 
-@samples(10)
+@samples(5)
 @given(experiments().filter(still_neighbours), st.integers(2, 4))
 def test_random_scenes(tmp_path_factory, given_, size):
     compare(given_ | {"solver": NUMPY}, tmp_path_factory.mktemp("ranks"), size)
 
 
-@samples(10)
+@samples(5)
 @given(
     experiments(leaders=pulled_apart(), fracturing=st.just(True)).filter(still_neighbours),
     st.integers(2, 3),
@@ -119,7 +119,7 @@ def test_broken_scenes(tmp_path_factory, given_, size):
     compare(given_ | {"solver": NUMPY}, tmp_path_factory.mktemp("ranks"), size)
 
 
-@samples(10)
+@samples(5)
 @given(calibrated_experiments(), st.integers(2, 3))
 def test_calibrated_scenes(tmp_path_factory, given_, size):
     solver = given_.get("solver", {})
@@ -149,7 +149,7 @@ CASES = {
     "everything in motion": {"initial": {"type": "noise", "amplitude": 0.1}, "leaders": []},
     "memory": {"solver": NUMPY | {"relaxation": 0.8, "memory": 0.4}},
     "single precision": {"solver": NUMPY | {"precision": "float32"}},
-    "settling": {"solver": NUMPY | {"settle": {"tolerance": 0.05}}, "steps": 4000},
+    "settling": {"solver": NUMPY | {"settle": {"tolerance": 0.2}}, "steps": 4000},
     "numbers of particles": {"rule": Tiring(spread=0.1)},
     "numbers of bonds": {"fracture": Weakest(spread=0.1)},
     "damage": {"fracture": {"type": "damage", "onset": 0.1, "failure": 0.4}},
@@ -376,14 +376,10 @@ def test_partition_covers_all_rows_once_and_is_balanced(parts, columns):
 needs_mpi = pytest.mark.skipif(not MPIEXEC, reason="no mpiexec: pip install mpich")
 
 
-def pbdkit_on(size, *arguments, folder, **more):
-    command = [MPIEXEC, "-n", str(size), sys.executable, "-m", "pbdkit", *arguments]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=300, **more)
-
-
 SCRIPT = Path(__file__).parents[1] / "reliability" / "rank_runs.py"
 LINES = {
     "run": ["run", "paper/f2", "--set", "steps=40", "-o", "two.nc"],
+    "refused": ["run", "paper/f2", "--set", "rule.K=1"],
     "diverging": ["run", "paper/a", "--set", "solver.relaxation=2.5", "--set", "steps=200"],
     "random scenes": [str(SCRIPT), "--trials", "1"],
 }
@@ -410,12 +406,11 @@ def test_mpiexec_gives_the_file_of_one_process(launched, tmp_path):
 
 
 @needs_mpi
-def test_errors_are_printed_once(launched, tmp_path):
-    refused = pbdkit_on(2, "run", "paper/f2", "--set", "rule.K=1", folder=tmp_path)
-    assert refused.returncode == 2
-    assert refused.stderr.count("pbdkit: ") == 1
-    assert "rule.K" in refused.stderr
-    diverged = launched[0]["diverging"]
+def test_errors_are_printed_once(launched):
+    refused, diverged = launched[0]["refused"], launched[0]["diverging"]
+    assert refused.statuses == [2] * 2
+    assert refused.err.count("pbdkit: ") == 1
+    assert "rule.K" in refused.err
     assert diverged.statuses == [4] * 2
     assert diverged.err.count("pbdkit: diverged") == 1
 

@@ -106,7 +106,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", in_turn(CASES, 2))
+@pytest.mark.parametrize("name", in_turn(CASES, 3))
 def test_several_processes_agree_with_one(name, tmp_path):
     given_ = strip(**CASES[name])
     compare(given_, tmp_path, 3)
@@ -260,7 +260,7 @@ bodies = st.builds(
 starts = one_of([{}, {"initial": {"type": "noise", "amplitude": 0.1}}])
 
 
-@samples(12)
+@samples(6)
 @given(
     bodies,
     one_of(LATTICES),
@@ -307,7 +307,7 @@ def test_strips_divide_every_grid():
             strips = [s.coarser(1) for s in strips]
 
 
-@pytest.mark.parametrize("sizes", in_turn([(3, 2), (2, 1), (1, 3)], 2))
+@pytest.mark.parametrize("sizes", in_turn([(3, 2), (2, 1), (1, 3)], 3))
 def test_interrupted_and_resumed_on_another_number_of_processes(sizes, tmp_path):
     given_ = strip(**CASES["released on the way"])
     one, several = tmp_path / "one.nc", tmp_path / "several.nc"

@@ -174,7 +174,7 @@ def test_the_distance_weighted_rule_is_reported_unstable_with_its_bound(parts, b
     assert any("is stable below" in w for w in Analysis(scene).warnings())
 
 
-@pytest.mark.parametrize(("lattice", "rule"), in_turn(product(LATTICES, RULES), 4))
+@pytest.mark.parametrize(("lattice", "rule"), in_turn(product(LATTICES, RULES), 6))
 def test_one_percent_inside_the_bound_converges_and_outside_diverges(lattice, rule):
     parts = {"lattice": LATTICES[lattice], "rule": RULES[rule]}
     start = {"type": "noise", "amplitude": 1e-9}
@@ -229,7 +229,7 @@ FEWER = {} if AT_LENGTH else {"modelling/double-cantilever": ["solver.increments
 """Settings of experiments of many increments: the first ones."""
 
 
-@pytest.mark.parametrize("name", in_turn([n for n in shipped_names() if "to-failure" not in n], 5))
+@pytest.mark.parametrize("name", in_turn([n for n in shipped_names() if "to-failure" not in n], 8))
 def test_predictions_for_shipped_experiments_hold(name):
     """Stable ones stay within the hull of their leaders' ways, with room; all shipped ones are that
     are made of steps, and those that go straight to equilibrium stay there too. Bodies that are

@@ -92,7 +92,7 @@ def test_reached_stretch_matches_runs_on_every_lattice(lattice, neighbours, fram
             [(0.7, 0.0), (1.0, 0.9), (0.5, -0.4)],
             ["mean", "lag"],
         ),
-        2,
+        3,
     ),
 )
 def test_relaxation_and_momentum_affect_the_distance(rule, weights, frame):

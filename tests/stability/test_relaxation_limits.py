@@ -58,7 +58,7 @@ def step_sizes(lattice, neighbours, shells, rule, relaxation, steps, columns):
     ("case", "rule"),
     [
         (case, ("barycentre", "mean-displacement")[n % 2])
-        for n, case in enumerate(in_turn(AVERAGING, 2))
+        for n, case in enumerate(in_turn(AVERAGING, 3))
     ],
 )
 def test_averaging_converges_1_percent_inside_its_bound_and_not_outside(case, rule):

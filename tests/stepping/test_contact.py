@@ -398,7 +398,7 @@ BALANCED = {
 
 
 @pytest.mark.parametrize(
-    ("case", "loaded"), [(case, n % 2 == 1) for n, case in enumerate(in_turn(BALANCED, 2))]
+    ("case", "loaded"), [(case, n % 2 == 1) for n, case in enumerate(in_turn(BALANCED, 3))]
 )
 def test_forces_balance_in_every_equilibrium(case: str, loaded: bool) -> None:
     """Nothing is inside an obstacle, either."""

@@ -220,7 +220,7 @@ FRACTURE = {"type": "threshold", "thresholds": [2.4]}
 
 
 @pytest.mark.parametrize(
-    ("lattice", "rule", "fracture"), in_turn(all_pairs(LATTICES, RULES, [None, FRACTURE]), 2)
+    ("lattice", "rule", "fracture"), in_turn(all_pairs(LATTICES, RULES, [None, FRACTURE]), 3)
 )
 def test_repeated_runs_and_any_row_blocks_agree_bitwise(lattice, rule, fracture, monkeypatch):
     leaders = [HOLD_LEFT, pull_right(0.7, 0.1)]

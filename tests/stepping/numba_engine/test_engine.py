@@ -74,19 +74,19 @@ def assert_bitwise_equal(scene, *engines, calls=(1, 2, 7, 1, 12)):
     return reference
 
 
-@samples(30)
+@samples(20)
 @given(experiments())
 def test_kernel_logic_on_random_scenes(experiment):
     compare_interpreted(experiment)
 
 
-@samples(30)
+@samples(20)
 @given(experiments(leaders=pulled_apart(), fracturing=st.just(True)))
 def test_kernel_logic_on_broken_scenes(experiment):
     compare_interpreted(experiment)
 
 
-@samples(30)
+@samples(20)
 @given(calibrated_experiments())
 def test_kernel_logic_on_calibrated_scenes(experiment):
     compare_interpreted(experiment)
@@ -244,15 +244,15 @@ THREADED = {
 @pytest.fixture
 def banded(monkeypatch):
     """A scene large enough for several bands of rows."""
-    monkeypatch.setattr(compiled_stepper, "BAND", 100)
-    body = {"type": "grid", "columns": 36, "rows": 30}
+    monkeypatch.setattr(compiled_stepper, "BAND", 50)
+    body = {"type": "grid", "columns": 24, "rows": 20}
     return lambda parts: build_scene(pbdkit.Experiment(**sheet(body=body, **parts)))
 
 
 @pytest.mark.parametrize("parts", THREADED.values(), ids=THREADED)
 def test_kernel_logic_on_any_number_of_threads(parts, banded, interpreted):
     scene = banded(parts)
-    assert_bitwise_equal(scene, CompiledStepper(scene), CompiledStepper(scene, 2), calls=(1, 2, 7))
+    assert_bitwise_equal(scene, CompiledStepper(scene), CompiledStepper(scene, 2), calls=(1, 5))
 
 
 def test_band_contains_at_least_one_row(interpreted, monkeypatch):
@@ -288,19 +288,19 @@ def test_row_kinds_affect_only_speed(parts, interpreted, monkeypatch):
         assert_bitwise_equal(scene, CompiledStepper(scene))
 
 
-def test_thousands_of_neighbours_compile_in_seconds():
-    scene = build_scene(pbdkit.Experiment(**sheet(neighbours=MANY | {"shells": 24})))
-    assert max(map(len, scene.neighbourhood.slots)) == 2400
+def test_a_thousand_neighbours_compile_in_seconds():
+    scene = build_scene(pbdkit.Experiment(**sheet(neighbours=MANY | {"shells": 16})))
+    assert max(map(len, scene.neighbourhood.slots)) == 1088
     began = time.process_time()
     engine = CompiledStepper(scene)
     assert time.process_time() - began < 10.0
-    assert_bitwise_equal(scene, engine, calls=(1, 2))
+    assert_bitwise_equal(scene, engine, calls=(1, 1))
 
 
 @pytest.mark.parametrize("name", ["paper/d2", "paper/f2"])
 def test_a_whole_run_is_the_same(name, interpreted):
-    experiment = pbdkit.load(name, settings=["steps=80", "record.every=7"])
-    compiled = pbdkit.load(name, settings=["steps=80", "record.every=7", "solver.engine=compiled"])
+    experiment = pbdkit.load(name, settings=["steps=40", "record.every=7"])
+    compiled = pbdkit.load(name, settings=["steps=40", "record.every=7", "solver.engine=compiled"])
     one, other = pbdkit.run(experiment, progress=False), pbdkit.run(compiled, progress=False)
     for variable in one.variables:
         np.testing.assert_array_equal(one[variable], other[variable])

@@ -72,7 +72,7 @@ def test_most_components_support_several_steps_per_pass():
     assert {"fracture", "damage", "relaxed, with memory", "frame lag"} <= set(IN_ONE_PASS)
 
 
-@pytest.mark.parametrize("name", in_turn(IN_ONE_PASS, 2))
+@pytest.mark.parametrize("name", in_turn(IN_ONE_PASS, 3))
 def test_every_component(name):
     with small_passes():
         scene = scene_of(**IN_ONE_PASS[name])
@@ -145,7 +145,7 @@ WITH_MORE = {
 EVENTS = [(name, pieces) for name in WITH_MORE for pieces in ((1, 3) if AT_LENGTH else (3,))]
 
 
-@pytest.mark.parametrize(("name", "pieces"), in_turn(EVENTS, 2))
+@pytest.mark.parametrize(("name", "pieces"), in_turn(EVENTS, 3))
 def test_further_events_during_steps(name, pieces):
     with small_passes(order=backwards):
         scene = scene_of(**LONG | WITH_MORE[name])
@@ -169,7 +169,7 @@ CALLS = st.lists(st.integers(1, 9), min_size=1, max_size=4)
 PIECES = st.integers(1, 3)
 
 
-@samples(25)
+@samples(15)
 @given(experiments(), CALLS, PIECES, SIZES)
 def test_random_scenes(experiment, calls, pieces, sizes):
     compare(experiment, calls, pieces, sizes)
