@@ -49,7 +49,7 @@ class Guiding:
         guidance = Guidance(scene)
         self.guided = guided = guidance.at(step)
         self.free = np.eye(scene.axes) * ~guided.lead_axes.T[:, None]
-        self.turns = self.free + guidance.shares(guided)
+        self.turns = self.free + guidance.shares(step)
 
     def __bool__(self) -> bool:
         return len(self.guided.place) > 0

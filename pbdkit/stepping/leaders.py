@@ -126,16 +126,21 @@ class Guidance:
         self._scene = scene
         self.has_guides = has_guides(scene.leading)
         self.slanted = self.has_guides and material_of(scene.experiment.rule) is not None
-        self._cache: dict[tuple[bool, ...], tuple[Guided, Slants]] = {}
+        self._cache: dict[tuple[bool, ...], tuple[Guided, Floats, Slants]] = {}
 
     def at(self, step: int) -> Guided:
         """Return the guided particles of a step."""
         return self._at(step)[0]
 
+    def shares(self, step: int) -> Floats:
+        """Return an array of shape (particle, axis, axis). It contains S_ff⁻¹ S_fl for the pairs of
+        a free axis f and a led axis l, and zero for all other pairs of axes."""
+        return self._at(step)[1]
+
     def slants(self, step: int) -> Slants:
         """Return the factors by which the free moves of guided particles are corrected, for each
         pair of axes."""
-        return self._at(step)[1]
+        return self._at(step)[2]
 
     def correct(self, new: Floats, u: Floats, step: int) -> None:
         """Correct the displacements `new` of guided particles along free axes, in place. The moves
@@ -147,24 +152,23 @@ class Guidance:
         for (to, of), (place, share) in self.slants(step).items():
             flat[to, place] = flat[to, place] + share * (flat[of, place] - origin[of, place])
 
-    def _at(self, step: int) -> tuple[Guided, Slants]:
+    def _at(self, step: int) -> tuple[Guided, Floats, Slants]:
         roles = tuple(leading.group.leads(step) for leading in self._scene.leading)
         if roles not in self._cache:
             guided = guided_at(self._scene.raster, self._scene.leading, step)
-            self._cache[roles] = guided, self._slants_of(guided)
+            shares = self._shares_of(guided)
+            self._cache[roles] = guided, shares, self._slants_of(guided, shares)
         return self._cache[roles]
 
-    def _slants_of(self, guided: Guided) -> Slants:
-        shares, slants = self.shares(guided), {}
+    def _slants_of(self, guided: Guided, shares: Floats) -> Slants:
+        slants = {}
         for to, of in np.ndindex(shares.shape[1:]):
             rows = np.flatnonzero(np.abs(shares[:, to, of]) > STRAIGHT)
             if to != of:
                 slants[to, of] = guided.place[rows], shares[rows, to, of].astype(self._real)
         return slants
 
-    def shares(self, guided: Guided) -> Floats:
-        """Return an array of shape (particle, axis, axis). It contains S_ff⁻¹ S_fl for the pairs of
-        a free axis f and a led axis l, and zero for all other pairs of axes."""
+    def _shares_of(self, guided: Guided) -> Floats:
         axes = self._scene.axes
         shares = np.zeros((len(guided.place), axes, axes))
         if not self.slanted or not len(guided.place):
