@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ from pbdkit.lattice.fill import CELLS_AT_ONCE, NEAREST, cut_by_border
 from pbdkit.lattice.raster import FOLLOWER, Block, Raster
 from pbdkit.model.bodies import Body
 from pbdkit.model.experiment import Experiment
-from pbdkit.plugin import MixesCells, Setting, Slot, Stiffness, TearsCells
+from pbdkit.plugin import Lattice, MixesCells, Setting, Slot, Stiffness, TearsCells
 from pbdkit.plugin.fields import ByRegion
 from pbdkit.plugin.lattice import CellPolygon
 from pbdkit.plugin.rule import material_of
@@ -421,10 +421,26 @@ class _Cells:
         share = (at_corners <= 0.0).all(axis=0).astype(float)
         facing = np.zeros((len(share), 2, 2))
         width = max(math.dist(a, b) for a in self.polygon.rest for b in self.polygon.rest)
-        exaggerates = region.exaggerates()
-        reach = width if exaggerates else NEAREST * width
+        reach = width if region.exaggerates() else NEAREST * width
         near = np.flatnonzero(np.abs(at_corners).min(axis=0) <= reach)
         for cells in np.split(near, range(CELLS_AT_ONCE, len(near), CELLS_AT_ONCE)):
-            corners = self.x[:, cells], self.y[:, cells]
-            share[cells], facing[cells] = cut_by_border(signed, *corners, exaggerates=exaggerates)
+            corners = np.stack([self.x[:, cells], self.y[:, cells]])
+            share[cells], facing[cells] = _cut_cells(
+                region, self.experiment.lattice, corners.tobytes(), corners.shape
+            )
         return share, facing
+
+
+@lru_cache(maxsize=64)
+def _cut_cells(
+    region: Body, lattice: Lattice, corners: bytes, shape: tuple[int, ...]
+) -> tuple[Floats, Floats]:
+    """Return the shares of cells inside a region, and the orientation of its border in them.
+
+    The coordinates of their corners, (axis, corner, cell), are given as bytes, so that results are
+    kept. The derivatives of a fit, for instance, require scenes that have the same borders and
+    other values of parameters.
+    """
+    x, y = np.frombuffer(corners).reshape(shape)
+    signed = partial(signed_distance, region, lattice.cell())
+    return cut_by_border(signed, x, y, exaggerates=region.exaggerates())
