@@ -394,7 +394,7 @@ def lattice_system(
     the lattice is distributed among processes, `rows` are the rows of this process, and the system
     is linearised at rest.
     """
-    if moves and moves.is_compiled and state.u.any():
+    if moves and state.u.any() and moves.compile():
         matrix = differenced_matrix(scene, state, step, moves)
         rtol = DIFFERENCED
     else:

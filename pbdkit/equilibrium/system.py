@@ -34,12 +34,15 @@ from pbdkit.stepping.contact import Contact
 from pbdkit.stepping.engine_choice import Choice, make_engine, obstacle
 from pbdkit.stepping.followers import MoveFollowers, SlotFollowers
 from pbdkit.stepping.numpy_engine import Engine
-from pbdkit.stepping.program import Program, moves_of
+from pbdkit.stepping.program import moves_of
 from pbdkit.stepping.state import State
 from pbdkit.stepping.step import Step
 
 LARGEST_BY_NUMPY = 20_000
-"""Number of particles above which moves are evaluated by the compiled engine."""
+"""Number of particles up to which moves are always evaluated by numpy."""
+MAX_BY_NUMPY = 1_000_000
+"""Number of moves, summed over evaluations, above which the next ones are evaluated by the compiled
+engine. It was measured that numpy needs half a second for them, and compiling 4 to 8 s."""
 ROUNDING = 4 * float(np.finfo(float).eps)
 """Relative rounding error of a move."""
 
@@ -49,7 +52,7 @@ class Moves:
 
     Moves include relaxation but not momentum. Frame points follow the body, and obstacles have
     their positions at the given moment. With `compiles`, the evaluation is compiled for large
-    bodies. Compiling takes seconds and saves time if many states of one scene are evaluated.
+    bodies if many states are evaluated. Compiling takes seconds; the results have the same bits.
     """
 
     def __init__(self, scene: Scene, *, compiles: bool = True) -> None:
@@ -61,25 +64,25 @@ class Moves:
         self._loads = replace(scene.loads) if scene.loads else None
         stepped = replace(scene, loads=self._loads)
         large = compiles and scene.raster.count > LARGEST_BY_NUMPY
-        if large and not (scene.has_fracture or renews):
+        self._compilable: Scene | None = None
+        if large and not (scene.has_fracture or renews or obstacle()):
             experiment = scene.experiment.model_copy(update={"solver": stepping})
-            free = stepped.bare
-            stepped = replace(free, experiment=experiment, leading=_resting(scene))
-            choice = Choice("numpy" if obstacle() else "compiled", 1, "requested")
-            self._engine, _ = make_engine(stepped, choice)
-        self._operations: Program = ()
-        if self._engine is None:
-            sweep = MoveFollowers(stepped, SlotFollowers(stepped, stepping))
-            self._operations = moves_of(stepped, sweep)
+            bare = stepped.bare
+            self._compilable = replace(bare, experiment=experiment, leading=_resting(scene))
+        self._evaluated = 0
+        sweep = MoveFollowers(stepped, SlotFollowers(stepped, stepping))
+        self._operations = moves_of(stepped, sweep)
 
     def scale_loads(self, factor: float) -> None:
         """Multiply the loads by a factor from now on."""
         if self._loads:
             self._loads.factor = factor
 
-    @property
-    def is_compiled(self) -> bool:
-        """True if moves are evaluated by a compiled engine."""
+    def compile(self) -> bool:
+        """Compile the evaluation of a large body, and return whether it is compiled."""
+        if self._compilable:
+            self._engine, _ = make_engine(self._compilable, Choice("compiled", 1, "requested"))
+            self._compilable = None
         return self._engine is not None and self._engine.name == "compiled"
 
     def at(self, state: State, moment: float) -> Floats:
@@ -109,6 +112,9 @@ class Moves:
         flat = u.reshape(len(u), -1)
         if frame:
             frame.follow(flat, flat)
+        self._evaluated += self._scene.raster.count
+        if self._evaluated > MAX_BY_NUMPY:
+            self.compile()
         if self._engine:
             none = (None,) * len(self._scene.leading)
             start = replace(state, step=step - 1, previous=np.zeros_like(u), starts=none)

@@ -235,7 +235,7 @@ def all_tried(seed: int, numbers: Any) -> Counter[str]:
         write_sweep(whole, 0.1, RELAXATIONS[1:])
         with suppress(SystemExit):  # so that the processes that are forked find all modules loaded
             main_of_pbdkit([*COMMAND, "--quiet"])
-        for kind in KINDS:
+        for kind in sorted({KINDS[number % len(KINDS)] for number in numbers}):
             prepared(kind, base / kind, 0.1)
             prepared(kind, base / f"twin-{kind}", 0.101)
         right = content(whole / "s" / "sweep.nc")

@@ -230,7 +230,7 @@ def test_compiled_displacements_are_the_same_at_any_time(monkeypatch):
     monkeypatch.setattr(moves_of, "LARGEST_BY_NUMPY", 0)
     with interpreting():
         compiled = moves_of.Moves(scene)
-        assert compiled.is_compiled
+        assert compiled.compile()
         for moment in (0.5, 1.0, 1.25, 2.0):
             np.testing.assert_array_equal(compiled.at(state, moment), plain.at(state, moment))
     assert scene.loads.held_at is None
