@@ -431,6 +431,18 @@ def test_cells_that_do_not_begin_to_soften_need_not_wait():
     assert damage[0] < damage[1] < damage[2]
 
 
+def test_further_bonds_of_a_softening_cell_do_not_wait():
+    """The crack of a cell opens at the left edge, and then at both edges."""
+    given = Strained(rule=ELASTIC, body={"type": "grid", "columns": 2, "rows": 2})
+    shares, counts = np.where(given.X[:, 0] < 0.0, 0.5, 0.0), []
+    for share in (shares, 0.5 + 0.0 * shares):
+        opening = share * 2.0 * ENERGY / ONSET
+        u = np.stack([0.0 * opening, opening * given.X[:, 1]], axis=1)
+        assert not given.put(u, in_turn=True)
+        counts.append(np.count_nonzero(given.state.bond_values[0]))
+    assert 0 < counts[0] < counts[1]
+
+
 TORN = {
     "body": {"type": "grid", "columns": 6, "rows": 6},
     "cuts": [{"from": [-1.0, 2.5], "to": [2.2, 2.5], "at": 5}],

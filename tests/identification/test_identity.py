@@ -70,11 +70,9 @@ def test_larger_cell_changes_nothing(lattice):
     assert two_sites.spectrum.smallest == pytest.approx(one_site.spectrum.smallest, abs=1e-9)
 
 
-def test_lattice_scale_changes_nothing():
-    small, large = (
-        identity({"type": "square", "a": a}, EIGHT, {"type": "elastic", "poisson_ratio": 0.3})
-        for a in (1e-3, 1e3)
-    )
+@pytest.mark.parametrize("rule", [{"type": "elastic", "poisson_ratio": 0.3}, WEIGHTED])
+def test_lattice_scale_changes_nothing(rule):
+    small, large = (identity({"type": "square", "a": a}, EIGHT, rule) for a in (1e-3, 1e3))
     np.testing.assert_allclose(small.long.second, large.long.second, atol=1e-12)
     assert (small.spacing, large.spacing) == (1e-3, 1e3)
 
