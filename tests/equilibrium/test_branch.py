@@ -337,6 +337,8 @@ def test_increments_within_steps_are_recorded(monkeypatch):
     assert ds.sizes["time"] > 4
     time = ds.time.values
     np.testing.assert_allclose(ds.opening, MOUTH["to"] * time / 3, atol=1e-15)
+    parts = np.diff(time)
+    assert (parts[1:] <= 2.0 * parts[:-1]).all()
 
 
 def test_experiments_without_control_are_written_as_before():
