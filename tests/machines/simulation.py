@@ -222,6 +222,9 @@ class SimulationMachine(Counted):
             return
         if not was_over:
             states[last] = self.model
+            if self.run.outcome:  # the other recordings have ended, too
+                for _recording, others, _writes in self.records:
+                    others[last] = self.model
         if self.kind == "diverging":
             return
         with recording.dataset as dataset:
