@@ -366,7 +366,7 @@ def sweep(**options: Any) -> int | None:
 def fit(**options: Any) -> None:
     """Fit parameters to measured fields, or strengths to repeated tests, and estimate their
     errors."""
-    call("sweep:fit", **options)
+    call("fit:fit", **options)
 
 
 @click.command()
@@ -401,7 +401,7 @@ def init(**options: Any) -> None:
 def schema(**options: Any) -> None:
     """Print the JSON Schema of experiments, datasets, sweeps or fits, with all installed
     components."""
-    call("sweep:schema", **options)
+    call("schema:schema", **options)
 
 
 INTERFACE_NAMES = (

@@ -1,9 +1,7 @@
-"""Commands ``pbdkit sweep``, ``fit`` and ``schema``. The last one prints the schema of the files
-that the others read."""
+"""Command ``pbdkit sweep``, which runs the members of a sweep."""
 
 from __future__ import annotations
 
-import json
 import logging
 import sys
 from collections.abc import Iterator
@@ -13,20 +11,11 @@ from typing import Any
 
 import click
 
-import pbdkit
-from pbdkit.cli.output import refusals_as, refuse_output, refuse_unwritable, save
+from pbdkit.cli.output import refusals_as
 from pbdkit.errors import ExperimentError
-from pbdkit.fitting.fit_file import fit_schema, is_strength_fit
-from pbdkit.fitting.fit_result import Fitted
-from pbdkit.fitting.specimens import FittedSpecimens
-from pbdkit.io.atomic_file import write
-from pbdkit.io.layout import dataset_schema
-from pbdkit.model.schema import experiment_schema
-from pbdkit.plotting.fit_figures import draw_fit
-from pbdkit.plugin.registry import Registry
-from pbdkit.progress import Stop, progress_bar, stop_on_signals, waiting
+from pbdkit.progress import Stop, progress_bar, stop_on_signals
 from pbdkit.sweeps.execute import Summary, carry_out, executor_of
-from pbdkit.sweeps.specification import Member, SweepPlan, read_sweep, sweep_schema
+from pbdkit.sweeps.specification import Member, SweepPlan, read_sweep
 
 CONNECT_S = 10.0
 """Timeout for the connection to a cluster in seconds."""
@@ -132,34 +121,3 @@ def _show(summary: Summary) -> None:
             f"and {len(failures) - MAX_LISTED} more; see `status` and `message` in {summary.path}"
         )
         click.echo(rest, err=True)
-
-
-def fit(file: str, output: Path | None, picture: Path | None, force: bool, quiet: bool) -> None:
-    """Fit parameters to measured fields, or strengths to repeated tests, and estimate their
-    errors."""
-    path = output or Path(Path(file).name or "fit").with_suffix(".json")
-    refuse_output(path, force=force, experiment=Path(file))
-    if picture:
-        refuse_output(picture, force=force)
-    refuse_unwritable(picture, path)
-    if picture and is_strength_fit(file):
-        raise ExperimentError("a strength fit has no picture; omit --plot")
-    with waiting(f"fitting {file}", silent=quiet):
-        result = pbdkit.fit(file)
-    write(path, json.dumps(result.as_dict(), indent=2) + "\n", replace=force)
-    if not quiet:
-        click.echo(str(result))
-        click.echo(f"{path} written")
-    if picture:
-        assert isinstance(result, Fitted | FittedSpecimens)
-        save(picture, draw_fit(result), replace=force, quiet=quiet)
-
-
-def schema(what: str, builtin: bool) -> None:
-    """Print the JSON Schema of experiments, datasets, sweeps or fits."""
-    if what in (schemas := {"sweep": sweep_schema, "fit": fit_schema}):
-        result = schemas[what]()
-    else:
-        schema_of = {"experiment": experiment_schema, "dataset": dataset_schema}[what]
-        result = schema_of(Registry(), installed=not builtin)
-    click.echo(json.dumps(result, indent=2))
