@@ -272,7 +272,7 @@ def test_separated_members_of_a_sweep_are_kept(call, tmp_path):
         "version: 1\nexperiment: bar.json\nvary: {fracture.failure: [0.05, 0.06]}\n"
         "keep: {variables: [reaction]}\n"
     )
-    ended = call("sweep", str(path), "-o", str(tmp_path / "out"))
+    ended = call("sweep", str(path), "-o", str(tmp_path / "out"), "--workers", "1")
     assert ended.code == 0, ended.err
     with pbdkit.open(tmp_path / "out" / "sweep.nc") as ds:
         assert set(ds.status.values.tolist()) == {"separated"}

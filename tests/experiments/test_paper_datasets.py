@@ -137,9 +137,7 @@ def test_the_file_is_identical_to_the_dataset_in_memory(case, tmp_path):
 
 def test_the_file_opens_with_xarray_alone(tmp_path):
     path = tmp_path / "out.nc"
-    subprocess.run(
-        [sys.executable, "-m", "pbdkit", "run", "paper/b", "-o", path, "--quiet"], check=True
-    )
+    pbdkit.run("paper/b", output=path, progress=False)
     program = (
         "import sys; sys.modules['pbdkit'] = None\n"
         "import xarray; ds = xarray.open_dataset(sys.argv[1]).load()\n"

@@ -274,7 +274,7 @@ def test_sums_over_cells_have_a_fixed_order(tmp_path, monkeypatch):
     compare(sheet(**OTHERS["every diagnostic of cells"]), tmp_path, 3)
 
 
-@pytest.mark.parametrize("name", in_turn(OTHERS, 2))
+@pytest.mark.parametrize("name", in_turn(OTHERS, 3))
 def test_further_kinds_of_scenes(name, tmp_path):
     compare(sheet(**OTHERS[name]), tmp_path, 3)
 

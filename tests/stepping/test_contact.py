@@ -242,14 +242,16 @@ def test_run_on_rollers_converges_at_obstacles() -> None:
 
 @pytest.mark.parametrize("rule", [SPRINGS, ELASTIC], ids=["springs", "elastic"])
 def test_particle_guided_under_an_inclined_plate_slides_along_it(rule: Any) -> None:
-    """Wherever steps come from; what the plate exerts across the guide is a reaction of it."""
+    """Wherever steps come from, in the profile `long` also by another relaxation; what the plate
+    exerts across the guide is a reaction of it."""
     corner = {"select": {"nearest": [[6.0, 4.0]]}, **displaced(0.0, 0.4), "axes": ["y"]}
     given = {
         "rule": rule, "body": {"type": "grid", "columns": 7, "rows": 5},
         "leaders": [{"select": {"edge": "left"}, "motion": {"type": "hold"}}, corner],
         "obstacles": [plane([6.0, 4.1], [-1.0, -1.0])],
     }  # fmt: skip
-    solvers = {"solver": EQUILIBRIUM}, stepping(0.8, 0.85, 300), stepping(0.4, 0.9, 400)
+    steps = [stepping(0.8, 0.85, 300), stepping(0.4, 0.9, 400)]
+    solvers = [{"solver": EQUILIBRIUM}, *in_turn(steps, 2)]
     found = [at_rest(**given, **solver) for solver in solvers]
     for ds in found:
         assert ds.position.values[-1] == pytest.approx([5.7, 4.4], abs=1e-12)
@@ -279,14 +281,16 @@ PRESSING = {"disc": displaced(0.2, -1.4), "ring": displaced(-0.1, -0.15)}
 
 @pytest.mark.parametrize("shape", CURVED)
 def test_contact_at_round_outlines_is_path_independent(shape: str) -> None:
-    """Cells are cut, so that the compliance of particles depends on the direction."""
+    """Cells are cut, so that the compliance of particles depends on the direction. Steps of another
+    size are made in the profile `long`."""
     given = {
         **TRIANGLES, "rule": ELASTIC,
         "body": {"type": "rectangle", "width": 8.0, "height": 4.0},
         "leaders": [{"select": {"edge": "bottom"}, "motion": {"type": "hold"}}],
         "obstacles": [{"shape": CURVED[shape], **PRESSING[shape], "from": 2}],
     }  # fmt: skip
-    ways = {"solver": EQUILIBRIUM, "steps": 3}, stepping(1.0, 0.7, 250), stepping(0.6, 0.8, 250)
+    ways = [stepping(1.0, 0.7, 250), stepping(0.6, 0.8, 250)]
+    ways = [{"solver": EQUILIBRIUM, "steps": 3}, *in_turn(ways, 2)]
     found = [at_rest(**given | way) for way in ways]
     assert np.count_nonzero(np.abs(found[0].contact.values).max(axis=1) > 0.0) > 0
     for ds in found:

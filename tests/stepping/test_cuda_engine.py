@@ -27,9 +27,9 @@ ASKED = {"solver": {"type": "stepping", "engine": "gpu"}}
 
 
 def test_every_kind_of_scene_matches_numpy():
-    """In one process of the simulator, which takes seconds to begin; a third of the scenes, and all
-    of them in the profile `long`."""
-    every = 1 if AT_LENGTH else 3
+    """In one process of the simulator, which takes seconds to begin; a quarter of the scenes, and
+    all of them in the profile `long`."""
+    every = 1 if AT_LENGTH else 4
     file = Path(__file__).parents[1] / "gpu_cases.py"
     script = [sys.executable, "-W", "ignore", str(file), str(every)]
     places = os.pathsep.join(sys.path)
