@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
-from browser import browser, page  # noqa: F401  # fixtures
+from browser import browser, empty_page, page  # noqa: F401  # fixtures
 from hypothesis import settings
 from interpreted_kernels import interpreting
 

@@ -646,9 +646,13 @@ def experiment_text(parts: dict[str, Any]) -> str:
 def _brief(parts: dict[str, Any]) -> dict[str, Any]:
     """Omit every key without which the same experiment is built."""
     omitted: list[KeyPath] = []
+    try:
+        whole = Experiment.build(Source("page", parts))
+    except PbdkitError:  # A component is not installed.
+        return parts
     for path in list(_paths(parts))[:MAX_TRIED]:
         inside = any(path[: len(prefix)] == prefix for prefix in omitted)
-        if not inside and _same(_without(parts, [*omitted, path]), parts):
+        if not inside and _same(whole, _without(parts, [*omitted, path]), parts):
             omitted.append(path)
     return dict(_without(parts, omitted))
 
@@ -672,14 +676,12 @@ def _without(part: Any, omitted: list[KeyPath], path: KeyPath = ()) -> Any:
     return part
 
 
-def _same(brief: dict[str, Any], parts: dict[str, Any]) -> bool:
+def _same(whole: Experiment, brief: dict[str, Any], parts: dict[str, Any]) -> bool:
     try:
-        rebuilt: dict[str, Any] = Experiment.build(Source("page", brief)).model_dump(
-            mode="json", by_alias=True
-        )
-    except PbdkitError:  # The key is needed, or a component is not installed.
+        rebuilt = whole.of_parts(brief)
+    except PbdkitError:  # The key is needed.
         return False
-    return rebuilt == parts
+    return rebuilt.model_dump(mode="json", by_alias=True) == parts
 
 
 def title_of(dataset: xarray.Dataset) -> str:
