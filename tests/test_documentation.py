@@ -86,10 +86,10 @@ FEWER = {
     "sweep": ["--workers", "1"],
     "fit crack-field": ["--plot", "crack-field.png"],
     "run modelling/dogbone-to-failure": ["--set", "lattice.a=2.5"],
-    "run fracture/notched-beam": ["--set", "steps=4"],
+    "run fracture/notched-beam": ["--set", "steps=2"],
     "run paper/f2": ["--set", "steps=60"],
     "run material/dogbone": ["--set", "steps=240", "--set", "fracture.failure=0.002"],
-    "run fracture/edge-crack": ["--set", "steps=1"],
+    "run fracture/edge-crack": ["--set", "steps=1", "--set", "solver.increments=10"],
 }
 """Options of commands that take long: movies of fewer steps, which draw all of them alike; sweeps
 in this process; a fit with its picture, as that of LONG_FITS; runs of the first steps; and
