@@ -163,9 +163,12 @@ def test_late_leaders_hold_a_loaded_body_where_steps_have_moved_it():
 def test_check_lists_changes_before_which_the_body_converges(tmp_path):
     leaders = [LEFT | {"until": 9}, pulled(1.0, 0.5), LEFT | {"from": 30}]
     path = tmp_path / "late.yaml"
-    path.write_text(json.dumps(sheet(leaders=leaders, record=LAST)))
+    load = {"select": {"edge": "top"}, "force": [0.0, 1e-3], "from": 13}
+    rule = {"type": "elastic", "poisson_ratio": 0.3}
+    parts = {"rule": rule, "neighbours": {"type": "chebyshev", "shells": 1}, "loads": [load]}
+    path.write_text(json.dumps(sheet(leaders=leaders, **parts, record=LAST)))
     output = CliRunner().invoke(program, ["check", str(path)]).output
-    assert "also before leaders or loads change, after steps 9, 29" in output
+    assert "also before leaders or loads change, after steps 9, 12, 29" in output
 
 
 def test_load_before_leaders_is_refused_if_steps_diverge():
