@@ -484,3 +484,14 @@ def test_each_unknown_uses_up_one_value() -> None:
     J[:2] *= 1e4
     with pytest.raises(ExperimentError, match=r"the 2 values of measurement 0 determine 2\.0"):
         fit._redundancies(stub, at, [0])
+
+
+def test_sums_and_products_are_compared_at_a_fraction_of_the_distance_to_the_bounds() -> None:
+    """Against the direction the nearest bound is at 0.01, and along it at 0.02 / 0.5."""
+    z, direction, tried = np.ones(2), np.array([1.0, 0.5]), []
+    low, high = np.array([0.99, 0.9]), np.array([1.1, 1.02])
+    given = SimpleNamespace(bounds=lambda: (low, high), residuals=lambda z: tried.append(z) or z)
+    at = SimpleNamespace(z=z, at=SimpleNamespace(residuals=z))
+    uncertainty._is_product(given, at, np.arange(2), direction)
+    change = uncertainty.MAX_BOUND_FRACTION * 0.02 / 0.5 * direction
+    np.testing.assert_allclose(tried, [np.exp(change), 1.0 + change], rtol=1e-12)
