@@ -206,13 +206,15 @@ def test_every_process_excludes_the_same_cells(size, middle):
 
 @pytest.mark.parametrize("lattice", LATTICES.values(), ids=LATTICES)
 def test_particles_are_the_sites_inside_the_outline_wherever_it_lies(lattice):
-    body = {"type": "disc", "radius": 4.1, "centre": [7.3, -11.2]}
+    centre, origin = np.array([7.3, -11.2]), np.array([-60.2, 30.7])
+    body = {"type": "disc", "radius": 4.1, "centre": (origin + centre).tolist()}
     parts = {"rule": {"type": "barycentre"}, "frame": {"type": "none"}}
-    raster = build_scene(pbdkit.Experiment(**document(lattice, body, **parts))).raster
+    given = document(lattice | {"origin": origin.tolist()}, body, **parts)
+    raster = build_scene(pbdkit.Experiment(**given)).raster
     cells = np.stack(np.meshgrid(*[np.arange(-40, 41)] * 2), axis=-1).reshape(-1, 1, 2)
     sites = (cells @ np.array(raster.cell.vectors) + raster.cell.basis).reshape(-1, 2)
-    inside = sites[np.linalg.norm(sites - body["centre"], axis=1) <= body["radius"]]
-    found = raster.reference(raster.body_rows)
+    inside = sites[np.linalg.norm(sites - centre, axis=1) <= body["radius"]]
+    found = raster.reference(raster.body_rows) - origin
     order, back = (np.lexsort(each.round(6).T) for each in (found, inside))
     np.testing.assert_allclose(found[order], inside[back], atol=1e-9)
 

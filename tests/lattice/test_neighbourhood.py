@@ -79,6 +79,7 @@ def test_slots_come_in_exactly_opposite_mutual_pairs(lattice, metric):
         assert other.site == (-slot.site[0], -slot.site[1])
         assert other.shell == slot.shell
     for own in neighbourhood.slots:
+        assert [s.rest for s in own] == [s.rest for s in neighbourhood.slots[0]]
         assert sum(s.rest.x for s in own) == 0.0
         assert sum(s.rest.y for s in own) == 0.0
 
