@@ -19,10 +19,10 @@ TRUE = {"a": (0.25, 70.0), "b": (0.30, 60.0), "c": (0.33, 80.0)}
 NOISE = 1e-5
 
 
-@pytest.mark.parametrize("count", [2, 5])
-def test_exact_measurements_give_the_mean_and_the_standard_deviation(count):
-    values = np.array([3.1, 2.7, 3.6, 2.9, 3.3])[:count]
-    mean = random_effects(values, np.full(count, 1e-6))
+@pytest.mark.parametrize(("count", "unit"), [(2, 1.0), (5, 1.0), (5, 1e-6)])
+def test_exact_measurements_give_the_mean_and_the_standard_deviation(count, unit):
+    values = unit * np.array([3.1, 2.7, 3.6, 2.9, 3.3])[:count]
+    mean = random_effects(values, np.full(count, 1e-6 * unit))
     error = values.std(ddof=1) / np.sqrt(count)
     assert (mean.value, mean.error) == pytest.approx((values.mean(), error), rel=1e-4)
     assert mean.deviation == pytest.approx(values.std(ddof=1), rel=1e-4)
