@@ -325,7 +325,8 @@ def test_interrupted_and_resumed_on_another_number_of_processes(sizes, tmp_path)
 
 
 def test_no_process_stores_the_whole_body(monkeypatch):
-    """Three processes together take about as much as one, not three times as much."""
+    """Three processes together take about as much as one, not three times as much. Each evaluates
+    moves in blocks of a constant size, which one process needs once."""
     monkeypatch.setattr(parted_grids, "SMALL", 20_000)
     body = {"type": "grid", "columns": 900, "rows": 130}
     scene = build_scene(pbdkit.Experiment.model_validate(strip(body=body, diagnostics=[])))
@@ -343,7 +344,7 @@ def test_no_process_stores_the_whole_body(monkeypatch):
 
     steps(Execution())  # caches are filled, and counted for neither
     alone = peak(lambda: steps(Execution()))
-    assert peak(lambda: on_ranks(3, steps)) < 1.5 * alone
+    assert peak(lambda: on_ranks(3, steps)) < 1.8 * alone
 
 
 GRIDS = ["--set", "solver.method=multigrid"]
