@@ -340,7 +340,7 @@ class Store:
             with ExitStack() as stack:
                 return self._fault_within(open_read_only(self._path, stack), count, logs)
         except sqlite3.DatabaseError as error:
-            if error.sqlite_errorcode & 0xFF in LOCKED:
+            if _is_locked(error):
                 raise
             return f"is damaged: {error}"
 
@@ -426,7 +426,7 @@ class Store:
             raise StorageError(f"{self._folder}: {reason_of(error)}") from None
 
     def _reason(self, error: sqlite3.Error) -> str:
-        if getattr(error, "sqlite_errorcode", 0) & 0xFF in LOCKED:
+        if _is_locked(error):
             return (
                 f"another program has locked it for {PATIENCE_S:g} s; close that program, and run "
                 "the same command again: it continues with the stored results"
@@ -434,6 +434,12 @@ class Store:
         if is_full(self._folder):
             return FULL
         return f"{error}; repeat the command to continue with the stored results that are intact"
+
+
+def _is_locked(error: sqlite3.Error) -> bool:
+    """Return whether another program has locked the database. Errors of Python itself, such as that
+    for text that is not UTF-8, have no code."""
+    return getattr(error, "sqlite_errorcode", 0) & 0xFF in LOCKED
 
 
 def _may_become_database(path: Path) -> bool:

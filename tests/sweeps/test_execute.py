@@ -339,12 +339,21 @@ def test_intact_part_of_a_damaged_database_is_kept(small, tmp_path, run_only):
     assert run_only == []
 
 
-def test_schema_that_is_not_text_is_set_aside(small, tmp_path, run_only):
+@pytest.mark.parametrize(
+    ("word", "changed", "words"),
+    [
+        (b"CREATE TABLE", b"CREATE\xffTABLE", "the schema is damaged"),
+        (b"message", b"messag\xff", "Could not decode to UTF-8"),
+    ],
+    ids=["a keyword", "a name"],
+)
+def test_schema_that_is_not_text_is_set_aside(word, changed, words, small, tmp_path, run_only):
+    """SQLite refuses a damaged keyword, and Python a damaged name."""
     asked = {"vary": {"steps": [5, 6]}, "folder": tmp_path}
     first, path = swept(small, **asked), tmp_path / stores.DATABASE
-    path.write_bytes(path.read_bytes().replace(b"CREATE TABLE", b"CREATE\xffTABLE"))
+    path.write_bytes(path.read_bytes().replace(word, changed))
     run_only.clear()
-    with pytest.warns(pbdkit.PbdkitWarning, match="the schema is damaged: .* 0 intact members"):
+    with pytest.warns(pbdkit.PbdkitWarning, match=f"{words}.* 0 intact members"):
         same(first, swept(small, **asked))
     assert len(run_only) == 2
 
