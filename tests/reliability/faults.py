@@ -22,6 +22,8 @@ LIBRARY = "PBDKIT_FAULTS"
 """The variable of the environment that names the library, which is preloaded then."""
 KINDS = {"eio": 1, "short": 2, "enospc": 3, "kill": 4, "memory": 5, "block": 6, "record": 7}
 """Number of each kind of fault in faults.c."""
+SECTOR = 512
+"""Number of bytes that a disk writes completely or not at all."""
 SKIPPED = 77
 """Exit status if the faults cannot be injected on this machine."""
 
@@ -105,14 +107,18 @@ class File:
         self.durable, self.waiting = bytes(self.content), []
 
     def torn(self, draw: random.Random) -> bytes:
-        """Return the content if the disk took some of the waiting changes, and half of others."""
+        """Return the content if the disk took some of the waiting changes, and the first half of
+        others, in whole sectors."""
         content = bytearray(self.durable)
         for offset, data in self.waiting:
             share = draw.choice([0.0, 0.5, 1.0])
             if data is None and share:
                 _resize(content, offset)
             elif data is not None and share:
-                _write(content, offset, data[: int(len(data) * share)])
+                end = offset + int(len(data) * share)
+                if share < 1.0:
+                    end = max(offset, end - end % SECTOR)
+                _write(content, offset, data[: end - offset])
         return bytes(content)
 
 
