@@ -75,12 +75,12 @@ COARSER = {
 """Changes of pages that take a minute; the site is built from them as they are. Candidates and
 profiles are tested in `fitting/`."""
 SPARSER = {
-    "pulls": {
+    "parameter-sweep": {
         "{from: 0.3, to: 1.0, count: 8}": "[0.3, 0.9, 1.0]",
         "{from: 0.0, to: 0.9, count: 7}": "[0.0, 0.6, 0.9]",
     },
 }
-"""Values of sweeps, replaced by some of them; the profile `long` runs all members."""
+"""Values of the sweeps of pages, replaced by some of them; the profile `long` runs all members."""
 FEWER = {
     "animate": ["--every", "20"],
     "sweep": ["--workers", "1"],
@@ -114,11 +114,11 @@ def save_experiments(page):
         if name := script_of(code):
             Path(name).write_text(code)
     for code in blocks_in(page, "yaml"):
-        name, text = name_of(page, code), code
-        for values, some in SPARSER.get(name, {}).items() if not AT_LENGTH else ():
+        text = code
+        for values, some in SPARSER.get(page.stem, {}).items() if not AT_LENGTH else ():
             assert values in text
             text = text.replace(values, some)
-        Path(f"{name}.yaml").write_text(text)
+        Path(f"{name_of(page, code)}.yaml").write_text(text)
 
 
 def install(page):
