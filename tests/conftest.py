@@ -48,12 +48,6 @@ def pytest_configure(config: pytest.Config) -> None:
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 
-@pytest.hookimpl(optionalhook=True)  # Mutation testing loads no other plugins.
-def pytest_xdist_auto_num_workers() -> int:
-    """One worker more than processors, because many tests wait for processes that they start."""
-    return len(os.sched_getaffinity(0)) + 1 if hasattr(os, "sched_getaffinity") else 2
-
-
 def pytest_collection_finish() -> None:
     """Exclude the present objects, which live until the end, from later garbage collection."""
     gc.collect()
