@@ -1,12 +1,7 @@
 """Several processes that share a run give the file of one, bit for bit."""
 
-import os
-import shutil
-import signal
 import sqlite3
-import subprocess
 import sys
-import time
 from contextlib import closing
 from functools import partial
 from itertools import count
@@ -14,8 +9,6 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import ClassVar, Literal
 
-import commands_on_ranks
-import h5netcdf
 import numpy as np
 import pytest
 from hypothesis import assume, given, strategies as st
@@ -26,7 +19,6 @@ from thread_ranks import on_ranks
 
 import pbdkit
 from pbdkit.io.netcdf import NetcdfSink
-from pbdkit.io.run_store import has_committed, status_of
 from pbdkit.mpi.partition import subdomains
 from pbdkit.progress import Watch
 from pbdkit.restart import resumption
@@ -34,9 +26,6 @@ from pbdkit.scene.scene import build_scene
 from pbdkit.simulation import Execution, record
 from tests.test_restart import contents
 
-BESIDE = Path(sys.executable).parent
-"""Place of the launcher of mpi4py's own MPI, whether or not the environment is activated."""
-MPIEXEC = shutil.which("mpiexec", path=BESIDE) or shutil.which("mpiexec")
 NUMPY = {"type": "stepping", "engine": "numpy"}
 
 
@@ -373,48 +362,6 @@ def test_partition_covers_all_rows_once_and_is_balanced(parts, columns):
     assert max(sizes) - min(sizes) <= 2 * 4 * parts
 
 
-needs_mpi = pytest.mark.skipif(not MPIEXEC, reason="no mpiexec: pip install mpich")
-
-
-SCRIPT = Path(__file__).parents[1] / "reliability" / "rank_runs.py"
-LINES = {
-    "run": ["run", "paper/f2", "--set", "steps=40", "-o", "two.nc"],
-    "refused": ["run", "paper/f2", "--set", "rule.K=1"],
-    "diverging": ["run", "paper/a", "--set", "solver.relaxation=2.5", "--set", "steps=200"],
-    "random scenes": [str(SCRIPT), "--trials", "1"],
-}
-
-
-@pytest.fixture(scope="module")
-def launched(tmp_path_factory):
-    """The outcomes of `LINES` in two processes that mpiexec starts, and their folder."""
-    folder = tmp_path_factory.mktemp("launched")
-    found = commands_on_ranks.on_ranks(MPIEXEC, 2, [*LINES.values()], folder)
-    return dict(zip(LINES, found, strict=True)), folder
-
-
-@needs_mpi
-def test_mpiexec_gives_the_file_of_one_process(launched, tmp_path):
-    done, folder = launched[0]["run"], launched[1]
-    assert done.statuses == [0] * 2, done.err
-    assert done.out.count("complete: ") == done.out.count(" on 2 processes") == 1
-    written(pbdkit.load("paper/f2", settings=["steps=40"]).model_dump(mode="json", by_alias=True),
-            tmp_path / "one.nc")  # fmt: skip
-    assert_same(tmp_path / "one.nc", folder / "two.nc")
-    with h5netcdf.File(folder / "two.nc", "r") as file:
-        assert file.attrs["ranks"] == "2"
-
-
-@needs_mpi
-def test_errors_are_printed_once(launched):
-    refused, diverged = launched[0]["refused"], launched[0]["diverging"]
-    assert refused.statuses == [2] * 2
-    assert refused.err.count("pbdkit: ") == 1
-    assert "rule.K" in refused.err
-    assert diverged.statuses == [4] * 2
-    assert diverged.err.count("pbdkit: diverged") == 1
-
-
 @pytest.mark.parametrize("names", [("PMI_SIZE",), ("OMPI_COMM_WORLD_SIZE", "PMIX_RANK")])
 def test_unconnected_processes_are_refused(names, monkeypatch, call):
     """The launcher belongs to one MPI and mpi4py to another."""
@@ -444,43 +391,3 @@ def test_without_an_mpi_library_the_message_names_one(monkeypatch, tmp_path, cal
 
 class Alone:
     COMM_WORLD = SimpleNamespace(size=1)
-
-
-@needs_mpi
-def test_a_sample_of_the_long_trial_on_random_scenes(launched):
-    done = launched[0]["random scenes"]
-    assert done.statuses == [0] * 2, done.out + done.err
-    assert "'compared': " in done.out
-
-
-@needs_mpi
-def test_killing_one_process_ends_all_and_the_run_resumes(tmp_path):
-    settings = ["--set", "steps=1000000", "--set", "record.every=1000000", "--quiet"]
-    arguments = ["run", "paper/a", *settings, "-o", "out.nc"]
-    command = [MPIEXEC, "-n", "2", sys.executable, "-m", "pbdkit", *arguments]
-    quiet = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
-    running = subprocess.Popen(command, cwd=tmp_path, **quiet)
-    try:
-        end = time.monotonic() + 60
-        while not has_committed(tmp_path / "out.nc"):
-            assert time.monotonic() < end
-            assert running.poll() is None
-            time.sleep(0.1)
-        every = processes_of(running.pid)
-        os.kill(every[-1], signal.SIGKILL)
-        assert running.wait(10) != 0
-        assert not set(every) & set(processes_of(1))
-    finally:
-        running.kill()
-        running.wait()
-    assert status_of(tmp_path / "out.nc")["step"] > 0
-
-
-def processes_of(launcher):
-    """The processes that a launcher has started, down to the last."""
-    text = subprocess.run(["ps", "-eo", "pid,ppid"], capture_output=True, text=True).stdout
-    pairs = [tuple(map(int, line.split())) for line in text.splitlines()[1:]]
-    found = [launcher]
-    for parent in found:
-        found += [pid for pid, above in pairs if above == parent]
-    return found

@@ -4,7 +4,6 @@ import json
 import re
 import tracemalloc
 
-import commands_on_ranks
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
@@ -24,9 +23,7 @@ from pbdkit.scene.scene import build_scene
 from pbdkit.simulation import Execution
 from tests.equilibrium.test_multigrid import Skew
 from tests.mpi.test_distributed_run import (
-    MPIEXEC,
     assert_same,
-    needs_mpi,
     on,
     stopping_after,
     written,
@@ -345,62 +342,3 @@ def test_no_process_stores_the_whole_body(monkeypatch):
     steps(Execution())  # caches are filled, and counted for neither
     alone = peak(lambda: steps(Execution()))
     assert peak(lambda: on_ranks(3, steps)) < 1.8 * alone
-
-
-GRIDS = ["--set", "solver.method=multigrid"]
-NOBODY = "leaders.0.select={box: [-9, -9, -8, -8]}"
-REEVALUATED = ["neighbours={type: euclidean, radius: 1.2, reevaluate: true}", "steps=20"]
-ALONE = {"material/bar": [], "paper/a": REEVALUATED}
-"""Experiments that several processes do not share: an equilibrium, and a run of steps."""
-LINES = {
-    "grids": ["run", "modelling/strip", *GRIDS, "-o", "two.nc"],
-    "unconverged": ["run", "modelling/strip", *GRIDS, "--set", "solver.tolerance=1e-17"],
-    "refused": ["run", "material/bar", "--set", NOBODY],
-} | {
-    name: ["run", name, *(f"--set={text}" for text in settings), "-o", f"{name[:5]}.nc"]
-    for name, settings in ALONE.items()
-}
-
-
-@pytest.fixture(scope="module")
-def launched(tmp_path_factory):
-    """The outcomes of `LINES` in two processes that mpiexec starts, and their folder."""
-    folder = tmp_path_factory.mktemp("launched")
-    found = commands_on_ranks.on_ranks(MPIEXEC, 2, [*LINES.values()], folder)
-    return dict(zip(LINES, found, strict=True)), folder
-
-
-@needs_mpi
-def test_mpiexec_gives_the_file_of_one_process(launched, tmp_path):
-    done, folder = launched[0]["grids"], launched[1]
-    assert done.statuses == [0] * 2, done.err
-    assert done.out.count("complete: ") == 1
-    experiment = pbdkit.load("modelling/strip", settings=GRIDS[1:])
-    written(experiment.model_dump(mode="json", by_alias=True), tmp_path / "one.nc")
-    assert_same(tmp_path / "one.nc", folder / "two.nc")
-
-
-@needs_mpi
-@pytest.mark.parametrize("name", ALONE)
-def test_first_process_runs_undistributed_work_alone(name, launched, tmp_path):
-    done, folder = launched[0][name], launched[1]
-    assert done.statuses == [0] * 2, done.err
-    assert done.err.count("; the first process runs it alone") == 1
-    assert done.out.count("complete: ") == 1
-    given_ = pbdkit.load(name, settings=ALONE[name]).model_dump(mode="json", by_alias=True)
-    written(given_, tmp_path / "one.nc")
-    assert_same(tmp_path / "one.nc", folder / f"{name[:5]}.nc")
-
-
-@needs_mpi
-def test_refusal_by_the_first_process_ends_all(launched):
-    done = launched[0]["refused"]
-    assert done.statuses == [2] * 2
-    assert done.err.count("selects no particle") == 1
-
-
-@needs_mpi
-def test_end_without_equilibrium_is_reported_once(launched):
-    done = launched[0]["unconverged"]
-    assert done.statuses == [4] * 2
-    assert done.err.count("pbdkit: unconverged: ") == 1
