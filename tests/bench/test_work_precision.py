@@ -31,11 +31,17 @@ def work_here(job, folder, cache):
 
 @pytest.fixture
 def here(monkeypatch):
-    """Jobs of compiled kernels run in processes of their own, and others in this process."""
+    """Jobs that compile run in processes of their own, and others in this process."""
     apart = measurement._run_in_process
 
-    def work(job, *folders):
-        return (apart if "engine=compiled" in str(job) else work_here)(job, *folders)
+    def work(job, folder, cache):
+        if "engine=compiled" not in str(job):
+            return work_here(job, folder, cache)
+        if not job["at"]:
+            return apart(job, folder, cache)
+        with monkeypatch.context() as patch:
+            patch.setenv("PBDKIT_CACHE_DIR", str(cache))
+            return work_here(job, folder, cache)
 
     monkeypatch.setattr(measurement, "_run_in_process", work)
 

@@ -37,7 +37,7 @@ OUT = Path("out.nc")
 @pytest.mark.parametrize(
     "trial",
     [
-        "kill_runs --trials 1 --kinds breaking",
+        "kill_runs --trials 1 --kinds settling",
         "two_writers --trials 1 --kinds small",
         "mutate_stores --trials 1 --kinds breaking",
         "mutate_sweeps --trials 1",
