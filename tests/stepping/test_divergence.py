@@ -117,6 +117,7 @@ def test_last_good_state_of_a_diverging_run_is_kept(
     monkeypatch.setattr(guard, "initial_state", lambda s: begun.append(s) or initial_state(s))
     crack = [[2.5, -1.0], [2.5, 1.5]]
     parts = {
+        "body": {"type": "grid", "columns": 8, "rows": 3},
         "initial": {"type": "noise", "amplitude": 1e-9},
         "fracture": {"type": "threshold", "thresholds": [1e12], "cracks": [crack]},
         "diagnostics": [{"type": "displacement"}, {"type": "pe2"}, {"type": "broken"}],
