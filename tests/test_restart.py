@@ -65,7 +65,7 @@ RUNS: dict[str, dict[str, Any]] = {
     "equilibrium, obstacles": {"solver": {"type": "equilibrium"}, "obstacles": COMES},
     "softened cells": SOFTENED,
     "equilibrium, softened cells": SOFTENED
-    | {"solver": {"type": "equilibrium", "increments": 10, "tolerance": 1e-3}},
+    | {"solver": {"type": "equilibrium", "increments": 4, "tolerance": 1e-3}},
     "equilibrium, fracture": {
         "solver": {"type": "equilibrium", "increments": 20},
         "fracture": FRACTURE,
@@ -336,7 +336,7 @@ LATER: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize("later", in_turn(LATER, 2))
+@pytest.mark.parametrize("later", in_turn(LATER, 3))
 @pytest.mark.filterwarnings("ignore:.* (begins|after the last step)")
 def test_converging_run_is_extended_to_the_longer_one(later: str, tmp_path: Path) -> None:
     """Events after the shorter run take place, whether or not it has converged."""
