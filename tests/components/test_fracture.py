@@ -164,11 +164,13 @@ STRAIN = {"type": "strain", "failure": 0.4371, **CUT}
     [("square", "float64"), ("square", "float32"), ("hexagonal", "float64")],
 )
 def test_compiled_engine_breaks_by_strain_bit_for_bit(lattice, precision):
-    """Single precision is compiled; for the others `stepping/numba_engine/test_engine` does."""
+    """Single precision is compiled, with a leader group on rollers; for the others
+    `stepping/numba_engine/test_engine` does."""
     solver = {"type": "stepping", "precision": precision}
-    scene = build_scene(pbdkit.Experiment(**bar(
-        9, pulled(0.1), STRAIN, lattice={"type": lattice, "a": 1.0}, solver=solver, **SHEET
-    )))  # fmt: skip
+    rollers = {"axes": ["x"]} if precision == "float32" else {}
+    leaders = [LEFT | rollers, SHEET["leaders"][1]]
+    parts = SHEET | {"lattice": {"type": lattice, "a": 1.0}, "leaders": leaders, "solver": solver}
+    scene = build_scene(pbdkit.Experiment(**bar(9, pulled(0.1), STRAIN, **parts)))
     with interpreting() if precision == "float64" else nullcontext():
         states = [engine.advance(initial_state(scene), 30)
                   for engine in (Stepper(scene), CompiledStepper(scene))]  # fmt: skip

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import runpy
-import subprocess
 import sys
 from math import gamma
 from pathlib import Path
@@ -363,12 +362,17 @@ def test_kinds_of_fits_are_distinguished():
         pbdkit.fit("fibres", measured=xarray.Dataset())
 
 
-def test_a_sample_of_the_long_trial():
-    script = ROOT / "tests/reliability/strength_coverage.py"
-    command = [sys.executable, str(script), "drawn", "--law", "weibull", "--trials", "20"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert done.stdout.count(" | ") == 13
+def test_a_sample_of_the_long_trial(monkeypatch, capsys):
+    monkeypatch.syspath_prepend(ROOT / "tests/reliability")
+    import strength_coverage
+
+    asked = ["strength_coverage", "drawn", "--law", "weibull", "--trials", "20"]
+    monkeypatch.setattr(sys, "argv", asked)
+    with pytest.raises(SystemExit) as end:
+        strength_coverage.main()
+    printed = capsys.readouterr().out
+    assert end.value.code == 0, printed
+    assert printed.count(" | ") == 13
 
 
 WRONG = {

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from changed_axes import Change, changed
+from scene_strategies import in_turn
 
 import pbdkit
 from pbdkit.equilibrium.load_stepping import equilibrium_state
@@ -130,11 +131,13 @@ PLAIN = {
 
 
 @pytest.mark.parametrize(
-    ("parts", "precision", "threads"), [({}, "float64", 2), (PLAIN, "float32", 1)]
+    ("parts", "precision", "threads"),
+    in_turn([({}, "float64", 2), (PLAIN, "float32", 1)], 2),
 )
 def test_both_engines_agree_bit_for_bit(parts, precision, threads, request):
     """At the upper left corner too, where what pushes at the guide adds to the move. Single
-    precision is compiled: Python would round otherwise."""
+    precision is compiled, as Python would round otherwise: in the profile `long`, and guided in
+    one direction in `components/test_fracture`."""
     if precision == "float64":
         request.getfixturevalue("compiled_at_length")
     solver = {"type": "stepping", "relaxation": 0.8, "memory": 0.5, "precision": precision}
