@@ -132,7 +132,7 @@ def test_cell_has_onset_strength_and_fracture_energy(lattice, rule):
         width = np.ptp(np.array(polygon.rest) @ normal)
         along_normal = 1.0 if rule == "plane strain" else float(normal @ uniaxial @ normal)
         strength, strain = onset * modulus / along_normal, np.outer(normal, normal)
-        ways = np.linspace(0.0, 2.1 * energy / (strength * width), 120)
+        ways = np.linspace(0.0, 2.1 * energy / (strength * width), 80)
         pulls = [float(normal @ given.stress(way * strain) @ normal) for way in ways]
         assert max(pulls) == pytest.approx(strength, rel=0.02)
         assert np.trapezoid(pulls, ways) * width == pytest.approx(energy, rel=0.02)

@@ -116,7 +116,7 @@ def shaken(scene, state):
     return state
 
 
-@pytest.mark.parametrize("name", in_turn(BARE, 6))
+@pytest.mark.parametrize("name", in_turn(BARE, 9))
 def test_runs_converge_in_the_predicted_steps(call, name):
     """With bonds that hold: torn bodies have another operator, see below."""
     whole = ["fracture={type: none}"] if name in TORN else []
@@ -144,7 +144,7 @@ def test_runs_converge_in_the_predicted_steps(call, name):
     assert abs(math.log(excess)) < 0.05 * math.log(1e3)
 
 
-@pytest.mark.parametrize("name", in_turn(STEPS, 4))
+@pytest.mark.parametrize("name", in_turn(STEPS, 6))
 def test_broken_bodies_stay_stable_and_converge_more_slowly(call, name):
     """The prediction is for the unbroken body, and the output states that; the operator of the torn
     one has the rate.

@@ -334,7 +334,7 @@ def test_bounds_that_exclude_the_minimum_are_named(tmp_path):
     def fitted_between(*bounds):
         given = {"file": str(path), "noise": NOISE}
         fit = {"experiment": made, "unknown": {"rule.poisson_ratio": bounds}, "measured": given}
-        found = pbdkit.fit(fit | {"modes": 3})
+        found = pbdkit.fit(fit | {"modes": 2})
         start = "unknown.rule.poisson_ratio: "
         return found, [text for text in found.warnings if text.startswith(start)]
 
