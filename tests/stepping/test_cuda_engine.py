@@ -27,16 +27,14 @@ ASKED = {"solver": {"type": "stepping", "engine": "gpu"}}
 
 
 def test_every_kind_of_scene_matches_numpy():
-    """In one process of the simulator, which takes seconds to begin; a quarter of the scenes, and
+    """In one process of the simulator, which takes seconds to begin; a sixth of the scenes, and
     all of them in the profile `long`."""
-    every = 1 if AT_LENGTH else 4
+    every = 1 if AT_LENGTH else 6
     file = Path(__file__).parents[1] / "gpu_cases.py"
     script = [sys.executable, "-W", "ignore", str(file), str(every)]
     places = os.pathsep.join(sys.path)
     simulated = os.environ | {"NUMBA_ENABLE_CUDASIM": "1", "PYTHONPATH": places}
-    done = subprocess.run(
-        [*script, str(every)], env=simulated, capture_output=True, text=True, check=False
-    )
+    done = subprocess.run(script, env=simulated, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-3000:]
     assert done.stdout.split("\n")[:-1] == gpu_cases.names(every)
 

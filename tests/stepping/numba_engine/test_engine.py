@@ -171,6 +171,31 @@ def test_kernel_logic_for_every_component(name, interpreted, monkeypatch):
     assert choose(scene).engine == "compiled"
 
 
+TOGETHER = {
+    "frame": Turning(),
+    "fracture": {
+        "type": "strain",
+        "failure": {"steps": [3, 20], "values": [0.6, 0.3]},
+        "cracks": TORN["cracks"],
+    },
+    "cuts": [{"from": [5.5, 7.0], "to": [5.5, 4.6], "at": 6}],
+    "leaders": [
+        {"select": {"edge": "left"}, "motion": {"type": "hold"}, "axes": ["x"]},
+        pull_right(0.3, 0.1) | {"until": 9},
+    ],
+    "obstacles": [
+        {
+            "shape": {"half_plane": {"point": [0.0, -0.3], "normal": [0.1, 1.0]}},
+            "motion": {"type": "velocity", "velocity": [0.0, 0.1], "steps": 8},
+        }
+    ],
+    "solver": {
+        "type": "stepping",
+        "relaxation": {"steps": [2, 9], "values": [0.8, 0.6]},
+        "memory": 0.2,
+    },
+}
+"""Matrices of a frame, and all that tears, guides and changes."""
 COMPILED = {
     "two sublattices, by place, lag and memory": {
         "lattice": LATTICES["hexagonal"],
@@ -178,30 +203,6 @@ COMPILED = {
         "frame": FRAMES["lag"],
         "initial": {"type": "noise", "amplitude": 0.1},
         "solver": {"type": "stepping", "relaxation": 0.7, "memory": 0.2},
-    },
-    "matrices of a frame, all that tears, guides and changes": {
-        "frame": Turning(),
-        "fracture": {
-            "type": "strain",
-            "failure": {"steps": [3, 20], "values": [0.6, 0.3]},
-            "cracks": TORN["cracks"],
-        },
-        "cuts": [{"from": [5.5, 7.0], "to": [5.5, 4.6], "at": 6}],
-        "leaders": [
-            {"select": {"edge": "left"}, "motion": {"type": "hold"}, "axes": ["x"]},
-            pull_right(0.3, 0.1) | {"until": 9},
-        ],
-        "obstacles": [
-            {
-                "shape": {"half_plane": {"point": [0.0, -0.3], "normal": [0.1, 1.0]}},
-                "motion": {"type": "velocity", "velocity": [0.0, 0.1], "steps": 8},
-            }
-        ],
-        "solver": {
-            "type": "stepping",
-            "relaxation": {"steps": [2, 9], "values": [0.8, 0.6]},
-            "memory": 0.2,
-        },
     },
     "48 neighbours that soften, drawn and counted": {
         "neighbours": MANY,
@@ -214,12 +215,12 @@ COMPILED = {
         "rule": Tiring(spread=0.1),
     },
 }
-"""Each kind of code that kernels are made of, several together in each; threads are below, single
-precision in `components/test_fracture`, and the built-in functions, a rule that moves by another
-and cells that soften too, in `testing/test_conformance`. The profile `long` compiles every
-component above as well."""
+"""Each kind of code that kernels are made of, several together in each; those above are compiled
+for threads, below, single precision in `components/test_fracture`, and the built-in functions, a
+rule that moves by another and cells that soften too, in `testing/test_conformance`. The profile
+`long` compiles every component above as well."""
 if AT_LENGTH:
-    COMPILED |= COMPONENTS
+    COMPILED |= COMPONENTS | {"together": TOGETHER}
 
 
 @pytest.mark.parametrize("parts", COMPILED.values(), ids=COMPILED)
@@ -261,10 +262,11 @@ def test_band_contains_at_least_one_row(interpreted, monkeypatch):
     assert_bitwise_equal(scene, CompiledStepper(scene), calls=(1,))
 
 
-@pytest.mark.parametrize("name", in_turn(THREADED, 4))
-def test_any_number_of_threads_gives_the_same(name, banded):
-    scene = banded(THREADED[name])
-    assert_bitwise_equal(scene, CompiledStepper(scene, 2))
+@pytest.mark.parametrize("parts", [TOGETHER, *(THREADED.values() if AT_LENGTH else ())])
+def test_any_number_of_threads_gives_the_same(parts, banded):
+    scene = banded(parts)
+    reference = assert_bitwise_equal(scene, CompiledStepper(scene, 2))
+    assert not scene.has_fracture or (reference.broken_step > 0).any()
 
 
 @pytest.mark.parametrize("kind", ["whole", "torn"])
