@@ -371,7 +371,7 @@ def test_picture_that_cannot_be_encoded_blames_no_file_that_is_read(
 def test_sample_of_disk_faults() -> None:
     """The script tries each call of each command; tests/reliability/disk_faults.py."""
     some = ["--command", "run,init --from", "--kind", "eio,kill,torn,block"]
-    some += ["--first", "5", "--every", "25"]
+    some += ["--first", "5", "--every", "50"]
     done = subprocess.run(
         [sys.executable, str(SCRIPT), *some], capture_output=True, text=True, check=False
     )
