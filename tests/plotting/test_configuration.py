@@ -341,7 +341,8 @@ def test_variable_without_attributes_is_labelled_with_its_name(torn):
 
 
 def test_one_of_several_runs_must_be_selected(tensile):
-    swept = pbdkit.sweep(tensile, vary={"rule.type": ["barycentre", "mean-displacement"]})
+    kinds = ["barycentre", "mean-displacement"]
+    swept = pbdkit.sweep(tensile, vary={"rule.type": kinds}, workers=1)
     with pytest.raises(ExperimentError) as refused:
         swept.pbd.plot()
     dimension = next(d for d in swept.position.dims if d not in ("time", "particle", "axis"))
