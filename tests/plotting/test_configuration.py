@@ -437,7 +437,7 @@ def test_fields_end_at_the_deformed_outline(name):
     assert not ds.inside.all()
     moved, back = bent(ds.reference.values)
     ds = ds.isel(time=[0]).assign(position=ds.position.isel(time=[0]).copy(data=moved[None]))
-    ax = plot(ds, color="reference_x", filled=True, figsize=(8, 6), dpi=60)
+    ax = plot(ds, color="reference_x", filled=True, figsize=(6, 4.5), dpi=60)
     image = np.asarray(image_of(ax).get_array().filled(np.nan))
     left, right, low, high = image_of(ax).get_extent()
     pixel = (right - left) / image.shape[1]
