@@ -72,7 +72,7 @@ def run(experiment):
 
 
 @pytest.mark.parametrize(
-    "displacement", in_turn([[0, 1.2], [0, 2.0], [0.5, 4.0], [3.0, 0]], 2), ids=str
+    "displacement", in_turn([[0.5, 4.0], [0, 1.2], [0, 2.0], [3.0, 0]], 4), ids=str
 )
 def test_springs_follow_slow_loading_without_folding(displacement):
     small = {"columns": 8, "rows": 3}

@@ -275,7 +275,7 @@ kernels do as numpy does is tested with the engine."""
 
 @pytest.mark.parametrize(
     ("name", "engine"),
-    [*((name, "numpy") for name in in_turn(CASES, 2)), *((name, "compiled") for name in COMPILED)],
+    [*((name, "numpy") for name in in_turn(CASES, 3)), *((name, "compiled") for name in COMPILED)],
 )
 def test_every_kind_of_scene(name, engine, tmp_path, request):
     """Kernels of runs of a few steps are interpreted, and compiled in the profile `long`."""
@@ -291,7 +291,7 @@ def stopping_after(looks):
     return Watch(lambda: next(asked) >= looks)
 
 
-@pytest.mark.parametrize("sizes", in_turn([(3, 2), (2, 1), (1, 3)], 2))
+@pytest.mark.parametrize("sizes", in_turn([(3, 2), (2, 1), (1, 3)], 3))
 def test_resumed_on_another_number_of_processes(sizes, tmp_path, monkeypatch):
     """Stored and recorded data is read piece by piece."""
     for what in ("io.run_store.PART_BYTES", "restart.BLOCK_BYTES"):
