@@ -245,7 +245,7 @@ def test_body_broken_into_two_held_halves_has_a_complete_curve():
 def test_quasi_static_test_in_parts_equals_the_whole(increments, tmp_path):
     """A run that is stopped anywhere continues to the same file; steps after the last event too."""
     given = BAR | FRACTURE | {"steps": STEPS + 5, "record": {"increments": increments}}
-    given |= {"solver": {"type": "equilibrium", "increments": 60}}
+    given |= {"solver": {"type": "equilibrium", "increments": 30}}
     whole = ran(given)
     path, scene = tmp_path / "bar.nc", build_scene(pbdkit.Experiment(**given))
 
