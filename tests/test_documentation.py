@@ -88,6 +88,7 @@ FEWER = {
     "run modelling/dogbone-to-failure": ["--set", "lattice.a=2.5"],
     "run fracture/notched-beam": ["--set", "steps=2"],
     "run paper/f2": ["--set", "steps=60"],
+    "run kirsch.yaml -o": ["--set", "lattice.a=1.0"],
     "run steel-specimen.yaml": ["--set", "steps=400"],
     "run material/dogbone": ["--set", "steps=240", "--set", "fracture.failure=0.002"],
     "run fracture/edge-crack": ["--set", "steps=1", "--set", "solver.increments=10"],

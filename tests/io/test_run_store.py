@@ -43,7 +43,7 @@ OUT = Path("out.nc")
         "mutate_sweeps --trials 1",
         "equilibria fracture --trials 3",
         "equilibria bounds --trials 5",
-        "fit_coverage --trials 10 --processes 1 --kinds poisson",
+        "fit_coverage --trials 5 --processes 1 --kinds poisson",
     ],
 )
 def test_a_sample_of_the_long_trials(
