@@ -721,9 +721,9 @@ def test_variables_of_some_members_stay_theirs(small):
 
 
 def test_stress_test(tmp_path):
-    for steps in (1600, 9600):  # the first may end before the first commit
+    for steps in (3200, 9600):  # the first may end before the first commit
         (folder := tmp_path / str(steps)).mkdir()
-        found = under_fire(folder, members=4, kills=1, workers=2, steps=steps)
+        found = under_fire(folder, members=6, kills=1, workers=2, steps=steps)
         if found["killed"]:
             break
-    assert found == {"exit": 0, "killed": 1, "right": 4, "wrong": 0, "run again": 0}
+    assert found == {"exit": 0, "killed": 1, "right": 6, "wrong": 0, "run again": 0}
