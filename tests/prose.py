@@ -1,8 +1,8 @@
 """Check the prose of docstrings, comments, messages and pages: `python tests/prose.py`.
 
-Prints a line for each expression that docs/glossary.md replaces, and for each docstring that opens
-elliptically or has at most three words, and then a table of counts. Exits with 1 if there is such a
-line.
+Prints a line for each expression that docs/glossary.md replaces, for each docstring that opens
+elliptically or has at most three words, and for each count beyond its limit, and then a table of
+counts. Exits with 1 if there is such a line.
 """
 
 from __future__ import annotations
@@ -154,19 +154,35 @@ def project_texts() -> list[Text]:
     return [t for t in texts if t.kind != "message" or "tests/" not in t.file]
 
 
+KINDS = {"docstring": "pbdkit/", "message": "pbdkit/", "page": "docs/"}
+"""Kinds of texts that are counted, each with its folder."""
+LIMITS = {"person words per 10 000": 8, "elliptic openings, %": 3}
+"""Largest counts, which well-kept packages have too."""
+MIN_VERBS = 200
+"""Smallest number of plain verbs in 10 000 words of docstrings."""
+
+
+def unusual(kind: str, found: dict[str, float]) -> Iterator[str]:
+    """Yield a line for each count of a kind of texts that is beyond its limit."""
+    for name, limit in LIMITS.items():
+        if found[name] > limit:
+            yield f"{kind}s: {found[name]:.3g} {name}; at most {limit}"
+    if kind == "docstring" and found["plain verbs per 10 000"] < MIN_VERBS:
+        yield f"{kind}s: {found['plain verbs per 10 000']:.3g} verbs; at least {MIN_VERBS}"
+
+
 def main() -> int:
     """Print faults and counts, and return the exit status."""
     texts = project_texts()
-    found = list(faults(texts))
-    print(*found, sep="\n")
-    for folder, kind in (("pbdkit/", "docstring"), ("pbdkit/", "message"), ("docs/", "page")):
-        chosen = [t.text for t in texts if t.file.startswith(folder) and t.kind == kind]
-        print(
-            f"{kind}s in {folder}:",
-            *(f"{v:.4g} {k}" for k, v in counts(chosen).items()),
-            sep="\n  ",
-        )
-    return bool(found)
+    found = {
+        kind: counts([t.text for t in texts if t.file.startswith(folder) and t.kind == kind])
+        for kind, folder in KINDS.items()
+    }
+    lines = [*faults(texts), *(line for item in found.items() for line in unusual(*item))]
+    print(*lines, sep="\n")
+    for kind, values in found.items():
+        print(f"{kind}s:", *(f"{v:.4g} {k}" for k, v in values.items()), sep="\n  ")
+    return bool(lines)
 
 
 if __name__ == "__main__":
