@@ -34,7 +34,7 @@ from pbdkit.stepping.contact import Contact
 from pbdkit.stepping.engine_choice import Choice, make_engine, obstacle
 from pbdkit.stepping.followers import MoveFollowers, SlotFollowers
 from pbdkit.stepping.numpy_engine import Engine
-from pbdkit.stepping.program import moves_of
+from pbdkit.stepping.program import Program, moves_of
 from pbdkit.stepping.state import State
 from pbdkit.stepping.step import Step
 
@@ -71,7 +71,7 @@ class Moves:
             self._compilable = replace(bare, experiment=experiment, leading=_resting(scene))
         self._evaluated = 0
         sweep = MoveFollowers(stepped, SlotFollowers(stepped, stepping))
-        self._operations = moves_of(stepped, sweep)
+        self._operations: Program = moves_of(stepped, sweep)
 
     def scale_loads(self, factor: float) -> None:
         """Multiply the loads by a factor from now on."""
@@ -79,10 +79,11 @@ class Moves:
             self._loads.factor = factor
 
     def compile(self) -> bool:
-        """Compile the evaluation of a large body, and return whether it is compiled."""
+        """Compile the evaluation of a large body in place of that by numpy. Return whether it is
+        compiled."""
         if self._compilable:
             self._engine, _ = make_engine(self._compilable, Choice("compiled", 1, "requested"))
-            self._compilable = None
+            self._compilable, self._operations = None, ()
         return self._engine is not None and self._engine.name == "compiled"
 
     def at(self, state: State, moment: float) -> Floats:
